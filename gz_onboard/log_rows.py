@@ -190,7 +190,7 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
         schema["properties"] |= {"forgotten": {"type": "string"}} if topic == CHANGE_TOPIC else {}
         log.channel(topic, schema)
     counts = {name: {"type": "integer"} for name in COUNTS}
-    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "requests")}
+    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     objects = {"ride": object_schema("gz_onboard.Ride", RIDE_UNITS), "learned": {"type": "object"}}
     properties = counts | maps | reasons | objects

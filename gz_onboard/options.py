@@ -53,7 +53,7 @@ def _jobs(option: str) -> Callable[[str], float]:
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "log": (f"log: {_LOGS}", {"type": Path, "metavar": "LOG"}),
     "logs": (
-        f"logs of rides: {_LOGS}; or folders of them, of which CSV files are not read",
+        f"logs of rides: {_LOGS}; URLs, patterns, or folders of them, of which CSV files are not read",
         {"nargs": "+", "type": Path, "metavar": "LOG"},
     ),
     "--vehicle": (
@@ -113,18 +113,3 @@ def add_shared(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> 
     for name in names:
         text, about = _SHARED[name]
         parser.add_argument(name, **{"help": text, **about, **changes})
-
-
-def keep_old_name(parser: argparse.ArgumentParser, old: str, name: str) -> None:
-    """Let `parser` take `old`, as its option `name` was called before, without listing it."""
-    action = next(action for action in parser._actions if name in action.option_strings)
-    kind = _jobs(old) if name == "--jobs" else action.type
-    parser.add_argument(
-        old,
-        dest=action.dest,
-        nargs=action.nargs,
-        const=action.const,
-        type=kind or str,
-        default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,
-    )

@@ -93,7 +93,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["estimate"], "LOG"),
         (["estimate", RIDE, RIDE, "--jobs", "100000"], "--jobs 100000: must be 1 to 256 processes"),
         (["validate", RIDE, "--jobs", "0"], "--jobs 0: must be 1 to 256 processes"),
-        (["discover", RIDE, "--workers", "100000"], "--workers 100000: must be 1 to 256 processes"),
+        (["discover", RIDE, "--jobs", "100000"], "--jobs 100000: must be 1 to 256 processes"),
         (["estimate", str(ROOT / "dbc")], "dbc: this folder holds no log"),
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),

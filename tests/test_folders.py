@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import shutil
 from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.bus.logs import ESTIMATED, read_frames
+from gz_onboard.bus.logs import ESTIMATED, logs_among, read_frames
 from tests.bus.test_replay import Listener
 from tests.lab.short_logs import short_log
 from tests.support import LOGS, ROOT
@@ -121,6 +124,33 @@ def test_the_page_of_the_commands_has_them() -> None:
         name for names, what in told.items() if not what.startswith("error") for name in re.findall(r"`(\w+)", names)
     }
     assert taking == {*TAKING, "calibrate"}  # all
+
+
+def test_urls_patterns_and_folders_in_folders_are_logs(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    deep = folders / EMPTY / "2026" / "may"
+    deep.mkdir(parents=True)
+    (folders / EMPTY / ".trash").mkdir()
+    short_log(folders / EMPTY / ".trash" / "old.blf", FRAMES)
+    short_log(deep / "c.blf", FRAMES)
+    assert logs_among([Path(EMPTY)]) == [Path(EMPTY, "2026", "may", "c.blf")]
+    assert logs_among([Path(f"{FULL}/*.b*"), Path(f"{FULL}/b.log")]) == [Path(FULL, "a.blf"), Path(FULL, "b.log")]
+    assert [log.name for log in logs_among([folders / "**" / "c.blf"])] == ["c.blf"]
+    handler = functools.partial(SimpleHTTPRequestHandler, directory=folders)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/{FULL}"
+        assert cli.main(["estimate", f"{url}/a.blf?raw=1", "--no-plot", "--output", "out"]) == 0
+        assert (folders / "out" / "a.estimate.mcap").exists()
+        assert cli.main(["estimate", f"{url}/none.blf", "--no-plot"]) == 2
+        server.shutdown()
+    said = capsys.readouterr().err
+    assert f"{url}/none.blf: cannot be fetched: HTTP Error 404" in said
+    for argument, told in (
+        ("s3://bucket/a.blf", "s3://bucket/a.blf: only http, https and file"),
+        ("x/*.blf", "no file"),
+    ):
+        assert cli.main(["estimate", argument]) == 2
+        assert told in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from gz_onboard.bus import logs
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
-from gz_onboard.options import LOG_SUFFIXES, MOST_JOBS, add_shared, keep_old_name, number
+from gz_onboard.options import LOG_SUFFIXES, add_shared, number
 from gz_onboard.pipeline import filter_maker
 from tests.support import ROOT
 
@@ -48,18 +48,6 @@ def test_json_without_a_name_is_standard_output(parser):
     assert parser.parse_args([]).json is None
     assert parser.parse_args(["--json"]).json == "-"
     assert parser.parse_args(["--json", "table.csv"]).json == "table.csv"
-
-
-def test_an_old_name_is_the_same_option(parser):
-    keep_old_name(parser, "--workers", "--jobs")
-    keep_old_name(parser, "--out", "--output")
-    assert parser.parse_args(["--workers", "3"]).jobs == 3
-    assert parser.parse_args(["--jobs", "2"]).jobs == 2
-    assert parser.parse_args([]).jobs is None
-    assert str(parser.parse_args(["--out", "x.toml"]).output) == "x.toml"
-    assert "--workers" not in parser.format_help()
-    with pytest.raises(InputError, match=f"--workers 0: must be 1 to {MOST_JOBS} processes"):
-        parser.parse_args(["--workers", "0"])
 
 
 def test_the_formats_of_logs_are_those_that_can_be_read():

@@ -11,6 +11,7 @@ CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
 import mmap
@@ -19,7 +20,10 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
@@ -75,6 +79,7 @@ _FIRST_LINES = {
 _TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
 ESTIMATED = ".estimate.mcap"
 """The end of the name of what ``gz-onboard estimate`` writes."""
+_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.*)")  # a Path has one slash of two
 _HEAD = 8192  # bytes within which a text log shows what it is
 
 
@@ -170,24 +175,62 @@ def _by_content(head: bytes, time: str = "") -> str | None:
 
 
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
-    """`paths`, with the logs in it instead of each folder, by name. InputError for a folder without any.
+    """`paths`, with the logs in it and its folders instead of each folder, by name. InputError for one without any.
 
-    Of a folder no .csv or .txt, which are mostly something else, and nothing that ``gz-onboard estimate`` wrote; or,
-    for `estimates`, these in place of the logs that they are of; None: both.
+    A URL is fetched, and a pattern with ``*`` that the shell left is expanded. Of a folder no .csv or .txt, which are
+    mostly something else, and nothing that ``gz-onboard estimate`` wrote; or, for `estimates`, these in place of the
+    logs that they are of; None: both.
     """
     logs: list[Path] = []
-    for path in paths:
-        found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file, estimates))
-        if estimates and path.is_dir():
-            made = {file.name.removesuffix(ESTIMATED) for file in found if file.name.endswith(ESTIMATED)}
-            found = [file for file in found if log_stem(file) not in made]
+    for path in chain.from_iterable(map(_expanded, paths)):
+        if not path.is_dir():
+            logs.append(path)
+            continue
+        files = sorted(file for file in path.rglob("*") if file.is_file() and not _is_hidden(file.relative_to(path)))
+        found = [file for file in files if _is_log(file, estimates)]
+        if estimates:
+            made = {
+                file.with_name(file.name.removesuffix(ESTIMATED)) for file in found if file.name.endswith(ESTIMATED)
+            }
+            found = [file for file in found if file.with_name(log_stem(file)) not in made]
         if not found:
-            files = (file for file in sorted(path.iterdir()) if file.is_file() and _may_be_table(file))
-            table = next((file.name for file in files if is_table(file)), None)
+            table = next((file.relative_to(path) for file in files if _may_be_table(file) and is_table(file)), None)
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
             raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
     return logs
+
+
+def _expanded(path: Path) -> list[Path]:
+    """The file behind a URL, the files that a pattern stands for, or the path itself."""
+    if url := _URL.fullmatch(str(path)):
+        return [_fetched(f"{url[1]}://{url[2]}")]
+    if any(letter in str(path) for letter in "*?[") and not path.exists():
+        if not (found := sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))):
+            raise InputError(f"{path}: no file is called so")
+        return found
+    return [path]
+
+
+@cache
+def _fetched(url: str) -> Path:
+    """The file behind a URL, in a folder that lasts as long as this process."""
+    import urllib.request
+
+    if not url.startswith(("http://", "https://", "file://")):
+        raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
+    folder = TemporaryDirectory(prefix="gz-onboard-")
+    atexit.register(folder.cleanup)
+    file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
+    try:
+        urllib.request.urlretrieve(url, file)
+    except OSError as error:
+        raise InputError(f"{url}: cannot be fetched: {error}") from None
+    return file
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def log_stem(log: Path) -> str:
@@ -208,7 +251,7 @@ def _may_be_table(file: Path) -> bool:
 def _is_log(file: Path, estimates: bool | None) -> bool:
     name = file.name.lower().removesuffix(".gz")
     other = (".csv", ESTIMATED) if estimates is False else (".csv",)
-    return name.endswith(tuple(_READERS)) and not name.endswith(other) and file.is_file()
+    return name.endswith(tuple(_READERS)) and not name.endswith(other)
 
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:

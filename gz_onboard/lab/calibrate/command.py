@@ -22,7 +22,7 @@ from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
-from gz_onboard.options import add_shared, keep_old_name
+from gz_onboard.options import add_shared
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.progress import progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
@@ -125,7 +125,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--held-out", metavar="FILE", action="append", default=[], help="the same as --with held_out=FILE")
     add("--set", metavar="OPTION=VALUE", action="append", default=[], help="an option of a procedure")
     add_shared(parser, "--output", default=None, metavar="TOML", help="write the vehicle file with what was found")
-    keep_old_name(parser, "--out", "--output")
     add_shared(parser, "--report", "--json", "--quiet")
 
 

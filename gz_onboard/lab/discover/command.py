@@ -28,7 +28,7 @@ from gz_onboard.offline.processes import Task, over_rides
 from gz_onboard.offline.results import distinct_names, explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.offline.schema import descriptions
-from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared, keep_old_name
+from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
@@ -59,7 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     jobs = min(2, os.cpu_count() or 1)
     add_shared(parser, "--seed")
     add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
-    keep_old_name(parser, "--workers", "--jobs")
     add_shared(parser, "--quiet")
     explain_keys(parser, "the report", VERSION, descriptions(Report))
 

@@ -24,7 +24,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     """(vehicle file, answer in JSON) of the whole calibration, half a minute."""
     folder = tmp_path_factory.mktemp("calibration")
     out, answer = folder / "reference.toml", folder / "answer.json"
-    assert main(["calibrate", "all", str(DATA), "--out", str(out), "--json", str(answer)]) == 0
+    assert main(["calibrate", "all", str(DATA), "--output", str(out), "--json", str(answer)]) == 0
     return out, json.loads(answer.read_text())
 
 

@@ -25,7 +25,7 @@ DATA = LOGS / "calibration"
 def test_one_procedure_gives_file_report_and_json(tmp_path, capsys):
     out, page, answer = tmp_path / "new.toml", tmp_path / "r.html", tmp_path / "a.json"
     files = [str(DATA / "motor_dyno.csv.gz"), "--with", f"emf={DATA / 'motor_emf_ramp.csv.gz'}"]
-    written = ["--out", str(out), "--report", str(page), "--json", str(answer)]
+    written = ["--output", str(out), "--report", str(page), "--json", str(answer)]
     assert main(["calibrate", "motor", *files, *written]) == 0
     told = capsys.readouterr().out
     found = json.loads(answer.read_text())["procedures"][0]["parameters"]
@@ -55,13 +55,13 @@ def test_all_of_a_folder_uses_what_came_before(tmp_path, capsys):
     manifest = 'schema = 1\n[ocv]\ndata = "cell_ocv_25C.csv.gz"\n[losses]\ndata = "motor_dyno.csv.gz"\n'
     (tmp_path / "calibration.toml").write_text(manifest + '[motor]\ndata = "motor_dyno.csv.gz"\n')
     out = tmp_path / "new.toml"
-    assert main(["calibrate", "all", str(tmp_path), "--out", str(out), "--json", "-"]) == 0
+    assert main(["calibrate", "all", str(tmp_path), "--output", str(out), "--json", "-"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [p["procedure"] for p in document["procedures"]] == ["motor", "losses", "ocv"]
     groups = tomllib.loads(out.read_text())["correlation"]
     assert "torque_constant" in groups["losses"]["parameters"]  # tied to a parameter of an earlier procedure
     before = out.read_text()
-    assert main(["calibrate", "all", str(tmp_path), "--out", str(out), "--json", "-"]) == 0
+    assert main(["calibrate", "all", str(tmp_path), "--output", str(out), "--json", "-"]) == 0
     assert out.read_text() == before
 
 
@@ -110,7 +110,7 @@ def test_a_folder_of_rides_is_its_logs(tmp_path, capsys):
         ),
         (["pulse", "cell_pulse_25C.csv.gz", "--set", "method=dirct"], r"pulse: method 'dirct' .*did you mean 'direct'"),
         (["coastdown", "motor_dyno.csv.gz", "motor_emf_ramp.csv.gz"], "motor_dyno.csv.gz: no column for 'time'"),
-        (["motor", "motor_dyno.csv.gz", "--out", "none/x.toml"], "there is no folder none"),
+        (["motor", "motor_dyno.csv.gz", "--output", "none/x.toml"], "there is no folder none"),
         (["motor", "motor_dyno.csv.gz", "--vehicle", "refrence"], r"no such vehicle file; .*did you mean 'reference'"),
         (["all", "..", ".."], "all takes one folder"),
         (["wheel", "../../dbc"], "dbc: this folder holds no log"),
@@ -129,7 +129,7 @@ def test_wrong_use_is_named(arguments, message, monkeypatch, capsys):
 def test_nothing_is_written_when_something_is_wrong(tmp_path, monkeypatch):
     monkeypatch.chdir(DATA)
     out = tmp_path / "x.toml"
-    assert main(["calibrate", "ocv", "motor_dyno.csv.gz", "--out", str(out)]) == 2
+    assert main(["calibrate", "ocv", "motor_dyno.csv.gz", "--output", str(out)]) == 2
     assert not any(tmp_path.iterdir())
 
 

@@ -91,7 +91,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"--{option}={folder / name}"
         for option, name in (("json", "out.json"), ("report", "out.html"), ("write-model", "new.toml"))
     ]
-    assert main(["discover", str(RIDE), "--workers", "1", "--quiet", *files]) == 0
+    assert main(["discover", str(RIDE), "--jobs", "1", "--quiet", *files]) == 0
     return folder
 
 
