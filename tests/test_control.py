@@ -135,7 +135,7 @@ def test_the_answer_has_units():
         "range  24.3 km",
     ]
     ends = {"battery_ends_after_m": 8123.4, "battery_ends_latitude": 48.1234567, "battery_ends_longitude": 11.5}
-    assert "  the battery ends in 8.1 km, at 48.12346°, 11.50000°" in route_text(on | ends).splitlines()
+    assert "  battery empty in 8.1 km, at 48.12346°, 11.50000°" in route_text(on | ends).splitlines()
     assert route_text({"route": "home", "state": "OFF", "along_m": None}) == "route  home\n  not on it"
 
 

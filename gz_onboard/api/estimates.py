@@ -92,7 +92,7 @@ def estimate(
 def _going_on(
     source: Path | SignalTable, vehicle: Vehicle, file: Path, how: How, log: Log, progress: Progress | None
 ) -> Ridden:
-    """The ride, gone on from the saved state `file`, which is saved after it."""
+    """The ride, resumed from the saved state `file`, which is saved after it."""
     not_an_input(saved_state.copies(file), [source] if isinstance(source, Path) else [])
     with held(file):
         at = state_at(file, source, span_of(source, vehicle))

@@ -70,7 +70,7 @@ def _at_its_end(answer: Mapping[str, object]) -> Iterator[str]:
     if after := _times(answer, "battery_ends_after_m", 1e-3, ".1f", "km"):
         places = (_times(answer, f"battery_ends_{axis}", 1, ".5f", "°") for axis in ("latitude", "longitude"))
         place = ", ".join(filter(None, places))
-        yield f"  the battery ends in {after}{f', at {place}' if place else ''}"
+        yield f"  battery empty in {after}{f', at {place}' if place else ''}"
     elif soc:
         yield f"  {soc} of charge at its end{f' ({low} to {high}, 80 % interval)' if low and high else ''}"
 

@@ -293,11 +293,11 @@ def _range(ride: RideSummary) -> str:
 
 
 def _state_text(ride: RideSummary) -> str:
-    if ride.saved_state == "begun":
-        return "begun with this ride"
+    if ride.saved_state == "new":
+        return "new with this ride"
     age, day = ride.saved_state_age_s, 24 * HOUR
     old = "of an unknown age" if age is None else f"{age / day:.1f} days old" if age > 2 * day else f"{clock(age)} old"
-    return f"continued from a saved state, {old} at the start"
+    return f"resumed, {old} at the start"
 
 
 def _durations(seconds: Mapping[str, float]) -> str:

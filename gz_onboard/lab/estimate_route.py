@@ -63,7 +63,7 @@ def route_text(route: RouteSummary) -> str:
     if route.battery_ends_km is None:
         text += f"{number(route.arrival_soc, '.0f', '%', 100)} of charge there ({low} to {high}, 80 % interval)"
     else:
-        text += f"the battery ends at km {route.battery_ends_km:.1f}"
+        text += f"battery empty at km {route.battery_ends_km:.1f}"
         if route.battery_ends_latitude_deg is not None:
             text += f" ({route.battery_ends_latitude_deg:.5f}, {route.battery_ends_longitude_deg:.5f})"
     return text if route.grade_known else f"{text}; its grades are not known"

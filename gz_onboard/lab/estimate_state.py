@@ -1,4 +1,4 @@
-"""The saved state of the daemon, gone on from by a recorded ride and saved after it.
+"""The saved state of the daemon, resumed by a recorded ride and saved after it.
 
 A daemon that cannot use a state sets it aside and begins anew: nobody is there. Here it is refused, and left as it is.
 """

@@ -78,10 +78,7 @@ class RideSummary:
         "left, energy to its end and state of charge there, km from its start and position where the battery ends "
         "before; or null",
     ]
-    saved_state: Annotated[
-        str | None,
-        "with --state: `gone on`: continued from a saved state; `begun`: the state begins with this ride; or null",
-    ]
+    saved_state: Annotated[str | None, "with --state: `resumed` from a saved state, or `new` with this ride; or null"]
     saved_state_age_s: Annotated[float | None, "age of that state when the ride began, if it is known"]
     innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
@@ -170,7 +167,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         why=why_of(last.why) if last.why else None,
         changes=list(map(why_of, changes)),
         route=route_summary(last, tally.on_route or last, tally.way_on_route, route.grade_known) if route else None,
-        saved_state=("gone on" if went_on.found else "begun") if went_on else None,
+        saved_state=("resumed" if went_on.found else "new") if went_on else None,
         saved_state_age_s=went_on.age if went_on else None,
         innovation_rms_v=tally.innovation_rms,
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,

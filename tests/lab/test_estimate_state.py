@@ -132,18 +132,18 @@ def table(begin: float) -> dict[str, Any]:
 def test_the_rides_are_in_their_order_and_each_goes_on_from_the_one_before(kept):
     rides = json.loads((kept / "said.json").read_text())["rides"]
     assert [Path(ride["file"]).stem for ride in rides] == ["c", "a", "b"]
-    assert [ride["saved_state"] for ride in rides] == ["begun", "gone on", "gone on"]
+    assert [ride["saved_state"] for ride in rides] == ["new", "resumed", "resumed"]
     ages = [ride["saved_state_age_s"] for ride in rides]
     assert ages[0] is None
     assert ages[1:] == pytest.approx([86_400 + 10, 2 * 86_400 + 40], abs=0.1)
     with (kept / "rides.csv").open() as table:
-        assert [row["saved_state"] for row in csv.DictReader(table)] == ["begun", "gone on", "gone on"]
+        assert [row["saved_state"] for row in csv.DictReader(table)] == ["new", "resumed", "resumed"]
 
 
 def test_what_was_learned_carries_over(kept, rides, tmp_path):
     alone = gz.estimate(rides / "b.blf", state=tmp_path / "alone.json").summary
     last = json.loads((kept / "said.json").read_text())["rides"][-1]
-    assert alone.saved_state == "begun"
+    assert alone.saved_state == "new"
     assert last["soc_start_sd"] < alone.soc_start_sd
     by_one, by_all = (gz.read_learned(file).riders[""] for file in (tmp_path / "alone.json", kept / "s.json"))
     assert all(by_one[name].share < by_all[name].share for name in ("price", "pace", "factor"))
@@ -178,7 +178,7 @@ def test_from_python_it_is_the_same(kept, rides, tmp_path):
 def test_a_table_of_signals_goes_on_too(tmp_path):
     rides = [table(1.7e9), table(1.7e9 + 3600)]
     first, second = (gz.estimate(ride, state=tmp_path / "s.json").summary for ride in rides)
-    assert (first.saved_state, second.saved_state) == ("begun", "gone on")
+    assert (first.saved_state, second.saved_state) == ("new", "resumed")
     assert second.saved_state_age_s == pytest.approx(3600 - 59.5)
     files = []
     for number, ride in enumerate(rides):
@@ -197,7 +197,7 @@ def test_what_a_table_has_no_column_for_stays_learned(tmp_path):
     gz.estimate(short_log(tmp_path / "ride.blf"), vehicle, state=file)
     before = snapshot(file)["learned"]["weakest"]
     found = gz.estimate(table(1.76e9), vehicle, state=file).summary
-    assert found.saved_state == "gone on"
+    assert found.saved_state == "resumed"
     assert snapshot(file)["learned"]["weakest"] == before
 
 
