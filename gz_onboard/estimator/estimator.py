@@ -198,7 +198,8 @@ class Estimator:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        power = None if voltage is None or current is None or modelled else voltage * current
+        carried = self.forecaster.riding.carried  # then no energy of the bus shows a grade
+        power = None if voltage is None or current is None or modelled or carried else voltage * current
         before = grades.faulty
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
         if grades.faulty != before:
@@ -243,18 +244,31 @@ class Estimator:
             still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
             self.forecaster.pause(still)
             return
-        self.ahead.ride(dt, speed, reading.voltage * reading.current)
+        power = reading.voltage * reading.current
+        self.ahead.ride(dt, speed, power)
         learned = self.forecaster.ride(
             dt,
             speed,
             self.road.grade,
-            reading.voltage * reading.current,
+            power,
             self._present.conditions(now, self.signals.motor_temperature.get(now)),
             self._present.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
+            self._drive(now, reading.voltage, power),
         )
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
+
+    def _drive(self, now: float, voltage: float, power: float) -> float:
+        """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
+        current, torque, turning = (
+            self.signals[role].get(now) for role in ("inverter_current", "motor_torque", "motor_speed")
+        )
+        if current is not None:
+            return voltage * current
+        if torque is not None and turning is not None:
+            return torque * turning
+        return power - self.forecaster.auxiliaries.whole
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
