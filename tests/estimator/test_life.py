@@ -506,6 +506,26 @@ def test_a_charge_that_pauses_says_no_time_until_full():
     _, row = follow(e, scooter.live(5, charge=0.9), scooter)[-1]  # plugged in, and nothing flows into the pack
     assert row.activity is Activity.CHARGING
     assert row.time_to_full is None
+    _, row = follow(e, scooter.live(65, charge=0.9), scooter)[-1]
+    assert row.activity is Activity.PARKED
+    assert row.range_full is None
+
+
+@pytest.mark.parametrize("shown", [1.0, 3.0], ids=["plugged in", "not available"])
+def test_a_plug_without_a_current_is_no_charge(shown):
+    scooter, e = Scooter(soc=0.17), estimator()
+    told = ((t, g, (v[0], shown) if g == OTHERS else v) for t, g, v in scooter.live(200))
+    rows = follow(e, told, scooter)
+    assert {row.activity for _, row in rows[2:]} == {Activity.PARKED}
+    assert rows[-1][1].range_full is None
+
+
+def test_a_plug_is_believed_where_no_current_is_known():
+    scooter, e = Scooter(soc=0.17), estimator([GROUPS[MOTOR], GROUPS[OTHERS]])
+    for t, group, values in scooter.live(200):
+        if group in (MOTOR, OTHERS):
+            e.handle((t, int(group == OTHERS), (values[0], 1.0) if group == OTHERS else values))
+    assert e.estimate(t).activity is Activity.CHARGING
 
 
 @pytest.mark.parametrize("start", [0.2, 0.6])

@@ -59,6 +59,7 @@ MISTAKES = [
     ("inverter_current", "scale = -1", "the sign of one"),
     ("throttle", 'unit = "1"', "may be %"),
     ("charge_plug", "scale = -1, offset = 1", "the other way round"),
+    ("charge_plug", "scale = -1, offset = 3", "a switch is 0 or 1"),
     ("brake_switch", "scale = -1, offset = 1", "the other way round"),
     ("bms_state_of_charge", 'unit = "1"', "dropped"),
 ]

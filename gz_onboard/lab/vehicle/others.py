@@ -100,7 +100,9 @@ def check_switches(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
             shown = float(np.nanmean(np.clip(ride[role][moving], 0.0, 1.0)))
             state = {"charge_plug": "plugged in", "key": "off", "contactor": "open"}[role]
             if abs(shown - riding) > 0.5:
+                most = float(np.nanmax(ride[role][moving]))
                 text = f"is {state} while riding: the other way round, scale = -1, offset = 1"
+                text = f"is {most:g} while riding, and a switch is 0 or 1: not available?" if most > 1 else text
                 yield wrong(words(role), (role,), text)
             else:
                 yield right(words(role), (role,), f"is not {state} while riding")
