@@ -230,7 +230,8 @@ class Estimator:
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
             self.ridden_by(f"{rider:g}")
-        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off, drive)
+        speed = 0.0 if signals.carried else self.road.speed
+        self._activities.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
         self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
@@ -311,7 +312,8 @@ class Estimator:
         return estimate
 
     def _reasons(self, now: float) -> Reason:
-        s, reasons = self.signals, self._missing.reasons(now, self._activities.takes_charge)
+        s = self.signals
+        reasons = self._missing.reasons(now, self._activities.takes_charge or s.carried)
         if self._sources.currents_differ:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
