@@ -289,12 +289,11 @@ class Estimator:
 
     def _drive(self, now: float, voltage: float, power: float) -> float:
         """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
-        current, torque, turning = (
-            self.signals[role].get(now) for role in ("inverter_current", "motor_torque", "motor_speed")
-        )
+        signals = self.signals
+        current, torque = signals.inverter_current.get(now), signals.motor_torque.get(now)
         if current is not None:
             return voltage * current
-        if torque is not None and turning is not None:
+        if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
             return torque * turning
         return power - self.forecaster.auxiliaries.whole
 

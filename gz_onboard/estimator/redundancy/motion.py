@@ -19,6 +19,7 @@ TREMBLES, RESTS = 0.2, 0.15  # m/s², rms from step to step; riding 0.23 and mor
 RESTED = 10.0  # s of rest: a sensor that dies on the road has no such time before
 UNCOUNTED = 1500.0  # m that an odometer does not count: longer than its steps
 NOISE = 0.5  # rad/s or m/s
+OWN = SPEEDS[:-1]  # what a receiver knows nothing of
 TURNS = 1.0  # N·m of a motor that drives
 
 
@@ -34,27 +35,28 @@ class CarriedCheck:
 
     def step(self, step: StepInputs) -> None:
         """See `SensorCheck`."""
-        signals, now = step.signals, step.now
+        signals, now, odometer = step.signals, step.now, step.signals.odometer
+        if not signals.gps_speed.stale_after:
+            return
+        before, self._counted = self._counted, odometer.last
+        if self._drives(signals, now) or (before or self._counted) != self._counted:
+            self._rest, self._way, signals.carried = 0.0, 0.0, False
+            return
+        own = [v for role in OWN if (v := signals[role].reported(now)) is not None]
         speed = signals.gps_speed.reported(now) or 0.0
-        own = [v for role in SPEEDS if role != "gps_speed" and (v := signals[role].reported(now)) is not None]
-        count, before = signals.odometer.get(now), self._counted
-        self._counted = count if count is not None else before
-        counted = self._counted != before
-        self._way = 0.0 if counted else self._way + speed * step.observed
-        if counted or any(abs(v) > NOISE for v in own) or self._drives(signals, now):
+        self._way += speed * step.observed
+        if any(abs(v) > NOISE for v in own) or (speed >= SPEED_APART and self._rest < RESTED):
             self._rest = 0.0
         elif speed < SPEED_APART:
             self._rest += step.observed
-        elif self._rest < RESTED:
-            self._rest = 0.0
-        rests = self._rest >= RESTED and (bool(own) or (count is not None and self._way > UNCOUNTED))
-        signals.carried = rests and (speed >= SPEED_APART or signals.carried)
+        known = bool(own) or (odometer.fresh(now) and self._way > UNCOUNTED)
+        signals.carried = known and self._rest >= RESTED and (speed >= SPEED_APART or signals.carried)
 
     def _drives(self, signals: Signals, now: float) -> bool:
         """Whether a motor does, or may: no sensor shows it."""
-        known = [x for role in ("inverter_current", "pack_current") if (x := signals[role].reported(now)) is not None]
-        torque = signals.motor_torque.reported(now)
-        return not known or abs(known[0]) > IDLE * self._capacity or abs(torque or 0.0) > TURNS
+        current, torque = signals.inverter_current.reported(now), signals.motor_torque.reported(now)
+        current = signals.pack_current.reported(now) if current is None else current
+        return current is None or abs(current) > IDLE * self._capacity or abs(torque or 0.0) > TURNS
 
 
 class MotionCheck:
