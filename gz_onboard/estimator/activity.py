@@ -1,8 +1,9 @@
 """What the vehicle does: riding, standing, parked, charging, asleep. Only riding teaches what a kilometre costs.
 
-A stop is short until it has lasted `STOP_TIME`, or the key is turned off or the contactor opens: then it is parked. A
-charge plug that is in means charging, unless the vehicle moves. Without a plug signal, or with one that is out, a
-charging current that lasts means it too, where it cannot be a brake's: at standstill, or while the inverter is silent.
+A stop is short until it has lasted `STOP_TIME`, or the key is turned off or the contactor opens: then it is parked. So
+it is with a charge plug in, and charging from the first charging current until none has flowed for `UNCHARGED_FOR`, or
+as long as no current is known. Without a plug signal, or with one that is out, a charging current that lasts means
+charging too, where it cannot be a brake's: at standstill, or while the inverter is silent.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
 CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
 SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
+UNCHARGED_FOR = 60.0  # s without that current: a charger that is dead, or done, though it is plugged in
 DRAWING_RATE = 0.2  # 1/h: a drive draws more at standstill only if the speed is wrong
 DRAWING_AFTER, DRAWING_MOST = 10.0, 30.0  # s of it at speed 0, less those without: the speed is wrong; most that counts
 PLUGGED_IN = 0.5  # of a signal that is 0 or 1
@@ -32,6 +34,7 @@ class Activities:
         self._followed = 0.0  # s since the first step
         self._moving = 0.0  # s of motion
         self._charging = 0.0  # s of a charging current without motion
+        self._uncharged = inf  # s since the last such current that lasted
         self._drawing = 0.0  # s of a drive's current without motion, less those without it
 
     def step(
@@ -62,9 +65,14 @@ class Activities:
             speed = None
         charged = c_rate is not None and c_rate < -CHARGING_RATE and not moving
         self._charging = self._charging + dt if charged else 0.0
+        self._uncharged = 0.0 if self._charging >= CHARGING_AFTER else self._uncharged + dt
+        plugged = plug is not None and plug > PLUGGED_IN and not moving
+        flows = c_rate is None or self._uncharged < UNCHARGED_FOR
         enough = CHARGING_AFTER if speed is not None else SILENT_CHARGING_AFTER if inverter_silent else inf
-        if not moving and ((plug is not None and plug > PLUGGED_IN) or self._charging >= enough):
+        if (plugged and flows) or self._charging >= enough:
             self.now = Activity.CHARGING
+        elif plugged and self._drawing < DRAWING_AFTER:
+            self.now = Activity.PARKED
         elif speed is None:
             self.now = Activity.UNKNOWN
         elif moving or self._still < STANDING_AFTER:

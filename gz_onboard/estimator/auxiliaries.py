@@ -36,6 +36,11 @@ class Auxiliaries:
             self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
 
     @property
+    def whole(self) -> float:
+        """All of them now [W]."""
+        return self._filed + self.now
+
+    @property
     def known(self) -> bool:
         """Whether their sensor has shown them, on this ride or the one before."""
         return self._seen > 0 or self.mean != 0

@@ -48,6 +48,8 @@ STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be e
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
 LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
 AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
+LEAP = 30.0  # s: whether a longer gap was one, or the clock was set, the odometer says
+COUNT_WITHIN = 3.0  # s after it
 NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
@@ -88,6 +90,9 @@ class Estimator:
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
         self._deadline = float("-inf")
+        self._odometer: float | None = None  # m, at the last step
+        self._count = 0.0  # m, the largest of its counts; 0: it has not counted yet
+        self._leapt: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activities, self._reading = Activities(), PackReading()
         self._outlook = Outlook(self.forecaster, battery, self.ahead)
         self._distrusted: tuple[str, ...] = ()
@@ -148,8 +153,8 @@ class Estimator:
         return True
 
     def _step(self, now: float) -> None:
-        dt = 0.0 if self._time is None else now - self._time
-        if dt < SHORTEST_STEP and self._time is not None:
+        dt = self._passed(now)
+        if dt is None or (dt < SHORTEST_STEP and self._time is not None):
             return
         self._time = now
         self._deadline = now + STEP_AT_LEAST
@@ -171,6 +176,28 @@ class Estimator:
             self._outlook.outdate()
         elif self._outlook.due(now):
             self._look_ahead(now, self.filter, temperature)
+
+    def _passed(self, now: float) -> float | None:
+        """The time since the last step [s], without what the clock was set by; None: the odometer has yet to tell.
+
+        What rides at both ends of a gap has ridden on in it, and the odometer has counted that.
+        """
+        dt = 0.0 if self._time is None else now - self._time
+        odometer, speed = self.signals.odometer, self.road.speed or 0.0
+        moved = 0.0 if self._odometer is None else odometer.value - self._odometer
+        if dt > LEAP and self._count and speed > MOVING:
+            self._leapt = self._leapt or now
+            came = odometer.time >= self._leapt - STEP_AT_LEAST
+            if not came and now - self._leapt < COUNT_WITHIN:
+                return None
+            self.road.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
+            least = min(speed, self.road.speed or 0.0) * dt / 2
+            if came and 0 <= moved + self._count < least:
+                dt, moved = max(now - self._leapt, SHORTEST_STEP), 0.0
+        elif 0 < moved < UNLEARNED:
+            self._count = max(self._count, moved)
+        self._leapt, self._odometer = None, odometer.last
+        return dt
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """What the pack gives by the sensors, else by the model."""
@@ -198,7 +225,8 @@ class Estimator:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        power = None if voltage is None or current is None or modelled else voltage * current
+        carried = self.forecaster.riding.carried  # then no energy of the bus shows a grade
+        power = None if voltage is None or current is None or modelled or carried else voltage * current
         before = grades.faulty
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
         if grades.faulty != before:
@@ -229,7 +257,8 @@ class Estimator:
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
             self.ridden_by(f"{rider:g}")
-        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off, drive)
+        speed = 0.0 if signals.carried else self.road.speed
+        self._activities.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
         self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
@@ -243,18 +272,30 @@ class Estimator:
             still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
             self.forecaster.pause(still)
             return
-        self.ahead.ride(dt, speed, reading.voltage * reading.current)
+        power = reading.voltage * reading.current
+        self.ahead.ride(dt, speed, power)
         learned = self.forecaster.ride(
             dt,
             speed,
             self.road.grade,
-            reading.voltage * reading.current,
+            power,
             self._present.conditions(now, self.signals.motor_temperature.get(now)),
             self._present.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
+            self._drive(now, reading.voltage, power),
         )
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
+
+    def _drive(self, now: float, voltage: float, power: float) -> float:
+        """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
+        signals = self.signals
+        current, torque = signals.inverter_current.get(now), signals.motor_torque.get(now)
+        if current is not None:
+            return voltage * current
+        if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
+            return torque * turning
+        return power - self.forecaster.auxiliaries.whole
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
@@ -297,7 +338,8 @@ class Estimator:
         return estimate
 
     def _reasons(self, now: float) -> Reason:
-        s, reasons = self.signals, self._missing.reasons(now, self._activities.takes_charge)
+        s = self.signals
+        reasons = self._missing.reasons(now, self._activities.takes_charge or s.carried)
         if self._sources.currents_differ:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)

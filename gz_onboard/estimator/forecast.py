@@ -50,6 +50,8 @@ FORM_FACTOR_SQUARED = 1.0, 6.0  # the same, of any riding
 ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is left out
 SPEEDS = -5.0, 70.0  # m/s: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
+DRIVES = 0.003  # of the weight: a motor that takes less does not drive; tyres alone take three times as much
+HEIGHTS_ERR = 3.0  # m: so much a climb may be wrong where it is to explain how a vehicle moves without its motor
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 COLDER_AGAIN = 0.005, 0.5, 0.5, 20.0  # SOC, degC, degC, W: changed by more, what colder cells lack is asked anew
@@ -127,15 +129,19 @@ class Forecaster:
         conditions: Conditions,
         inputs: EffectInputs | None = None,
         period: float = 0.0,
+        drive: float | None = None,
     ) -> bool:
         """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W].
 
         `inputs` are needed, and read, if the load is `extended`. `period` [s]: how often the speed comes, if seldom;
-        between two of its messages it has no acceleration that means anything. Gives whether a segment was learned.
+        between two of its messages it has no acceleration that means anything. drive: what the motor takes of the power
+        [W]; None: all. Gives whether a segment was learned.
         """
         r = self.riding
         r.add(dt, speed, grade, power, inputs)
-        self.calm.ride(abs(speed) * dt)
+        r.second.driven += (power if drive is None else drive) * dt
+        if not r.carried:
+            self.calm.ride(abs(speed) * dt)
         if r.second.seconds < max(1.0, period):
             return False
         before = speed if r.speed_before is None else r.speed_before
@@ -145,6 +151,13 @@ class Forecaster:
             return False
         segment = r.current
         modelled, to_come = self._modelled(mean, acceleration, conditions, inputs)
+        stored = self._weight * r.second.climb + self._moving_mass * (speed * speed - before * before) / 2
+        if abs(mean) > MOVING and grade is not None:
+            beside = self.auxiliaries.now * r.second.seconds
+            self._coast(modelled - (to_come - stored + r.second.energy - beside) / 2)
+            if r.carried:
+                self.pause()
+                return False
         if self.load.ledger:
             self.load.ledger.measured += r.second.energy
         segment.distance += abs(r.second.distance)
@@ -162,7 +175,6 @@ class Forecaster:
         if r.still <= STOP_TIME:
             segment.duration += r.second.seconds
             segment.squares += r.second.squares
-        stored = self._weight * r.second.climb + self._moving_mass * (speed * speed - before * before) / 2
         segment.level -= stored
         segment.climb += r.second.climb
         self.pattern.add(r.second, mean, acceleration)
@@ -171,6 +183,15 @@ class Forecaster:
             return False
         self._close(segment, conditions)
         return True
+
+    def _coast(self, unexplained: float) -> None:
+        """Take in the second: what the model asks for beyond half of a level road's and of what was measured [J]."""
+        r, weight = self.riding, self._weight
+        driven, before = r.second.driven > DRIVES * weight * abs(r.second.distance), r.carried
+        r.coast(None if driven else unexplained, HEIGHTS_ERR * weight)
+        if r.carried and not before:
+            r.take_back(r.coasted)
+            self._sum_past()
 
     def _modelled(
         self, speed: float, acceleration: float, conditions: Conditions, inputs: EffectInputs | None
@@ -221,12 +242,8 @@ class Forecaster:
         """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
         r, seen = self.riding, self.riding.usual
         self.pause()
-        distance -= r.current.distance
-        r.current = Segment()
         self.calm = Calm()  # what was shown came from that sensor too
-        while distance > 0 and r.segments and (before := r.segments[-1].learned):
-            distance -= r.segments.pop().distance
-            r.usual = before
+        r.take_back(distance)
         r.usual = unlearned(r.usual, seen)
         self._sum_past()
 

@@ -55,6 +55,7 @@ class Second:
     seconds: float = 0.0
     distance: float = 0.0  # m, negative backwards
     energy: float = 0.0  # J
+    driven: float = 0.0  # J of it into the motor
     squares: float = 0.0  # W²·s
     climb: float = 0.0  # m
     lateral: float = 0.0  # m²/s³: the square of the lateral acceleration
@@ -83,6 +84,9 @@ class Riding:
     time_moving: float = 0.0  # s, since the start or the last long standstill
     speed_before: float | None = None  # m/s, at the start of the second
     still: float = 0.0  # s since the last motion
+    coasted: float = 0.0  # m without the motor, of which road and bus leave something
+    unexplained: float = 0.0  # J
+    carried: bool = False  # so much that something else moves the vehicle
 
     @property
     def factor(self) -> float:
@@ -103,6 +107,21 @@ class Riding:
         if self.still >= COLD_AGAIN:
             self.time_moving = 0.0
         return ended
+
+    def coast(self, unexplained: float | None, most: float) -> None:
+        """Take in a second in which road and bus leave `unexplained` [J]; None: the motor drove. most: heights err."""
+        left = 0.0 if unexplained is None else self.unexplained + unexplained
+        self.unexplained = min(max(left, 0.0), 2 * most)
+        self.coasted = self.coasted + abs(self.second.distance) if self.unexplained else 0.0
+        self.carried = self.unexplained > most
+
+    def take_back(self, distance: float) -> None:
+        """Unlearn the last `distance` [m] or a little more."""
+        distance -= self.current.distance
+        self.current = Segment()
+        while distance > 0 and self.segments and (before := self.segments[-1].learned):
+            distance -= self.segments.pop().distance
+            self.usual = before
 
     def add(self, dt: float, speed: float, grade: float | None, power: float, inputs: EffectInputs | None) -> None:
         """`dt` [s] at `speed` [m/s], `grade` (sine) and `power` [W]."""

@@ -56,6 +56,7 @@ class Signals:
         for role, seconds in stale_after:
             self._all[role].stale_after = seconds
         self.__dict__ |= self._all
+        self.carried = False  # the receiver moves and the vehicle rests: what it shows is of a van
         self._mapped = [signal for signal in self._all.values() if signal.stale_after]
 
     if TYPE_CHECKING:
@@ -66,8 +67,8 @@ class Signals:
         return self._all[role]
 
     def fix_below(self, now: float, least: int) -> bool:
-        """Whether the GPS reports a fix worse than `least` (`FIX_2D`, `FIX_3D`)."""
-        return self.gps_fix.fresh(now) and self.gps_fix.value < least
+        """Whether the GPS reports a fix worse than `least` (`FIX_2D`, `FIX_3D`), or one that is not of the vehicle."""
+        return self.carried or (self.gps_fix.fresh(now) and self.gps_fix.value < least)
 
     def next_step(self) -> None:
         """Start new means."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from gz_onboard.errors import InputError, unreadable
 from gz_onboard.routes.columns import Columns
 from gz_onboard.routes.gpx import read_road
-from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
+from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of, without_holes
 
 LARGEST_FILE = 50_000_000  # bytes, unpacked: a GPX of the most points that are taken has a tenth of it
 
@@ -22,7 +22,7 @@ def read_ahead(file: Path) -> tuple[Columns, Route]:
         raise unreadable(file, error) from error
     if large:
         raise InputError(f"{file}: has more than {LARGEST_FILE / 1e6:.0f} MB, unpacked; a route has fewer")
-    columns = read_road(file, KNOWN_AHEAD)
+    columns = without_holes(read_road(file, KNOWN_AHEAD))
     return columns, route_ahead_of(columns, file.stem.removesuffix(".route"))
 
 

@@ -1,8 +1,14 @@
-"""GPX files: the track or, without one, the route in it, as columns."""
+"""GPX files: the track or, without one, the route in it, as columns.
+
+A recorder begins another segment after a pause, and another track after a day; a planner writes alternatives so. Those
+that begin where the one before ends are one road. Others are not: nobody knows what lies between.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import pairwise
+from math import cos, hypot, nan, radians
 from pathlib import Path
 from xml.parsers import expat
 
@@ -10,6 +16,9 @@ from gz_onboard.errors import InputError, shown, unreadable
 from gz_onboard.routes.columns import LEAST_ROWS, Columns, read_columns
 
 POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
+PARTS = ("trk", "trkseg", "rte")
+JOINED = 100.0  # m from the end of a part to the begin of the next, which is the same road
+EARTH = 6_371_000.0  # m, its radius
 Point = tuple[int, str, str, str]
 """(line, latitude, longitude, altitude) as they stand in the file; an altitude may be empty."""
 
@@ -18,7 +27,7 @@ class _Reader:
     """Gathers the points while the parser goes through the file."""
 
     def __init__(self) -> None:
-        self.points: dict[str, list[Point]] = {kind: [] for kind in POINTS}
+        self.parts: dict[str, list[list[Point]]] = {kind: [[]] for kind in POINTS}
         self._parser = expat.ParserCreate(namespace_separator=" ")
         self._parser.StartElementHandler = self._start
         self._parser.EndElementHandler = self._end
@@ -40,6 +49,9 @@ class _Reader:
             self._at = self._parser.CurrentLineNumber, attributes.get("lat", ""), attributes.get("lon", ""), ""
         elif kind == "ele" and self._at:
             self._altitude = []
+        elif kind in PARTS:
+            for parts in self.parts.values():
+                parts.append([])
 
     def _text(self, text: str) -> None:
         if self._altitude is not None:
@@ -50,7 +62,7 @@ class _Reader:
         if kind == "ele" and self._at and self._altitude is not None:
             self._at, self._altitude = (*self._at[:3], "".join(self._altitude).strip()), None
         elif kind in POINTS and self._at:
-            self.points[kind].append(self._at)
+            self.parts[kind][-1].append(self._at)
             self._at = None
 
 
@@ -60,9 +72,10 @@ def read_road(file: Path, known: Collection[str]) -> Columns:
 
 
 def read_gpx(file: Path) -> Columns:
-    """Latitude, longitude and, if all points have it, altitude of the track in a GPX `file`.
+    """Latitude, longitude and, if most points have it, altitude (else NaN) of the track in a GPX `file`.
 
-    A point at the place of the one before it is passed over. Raises InputError naming file and line.
+    A point at the place of the one before it is passed over. Raises InputError naming file and line, also for parts
+    that do not join.
     """
     reader = _Reader()
     try:
@@ -75,14 +88,29 @@ def read_gpx(file: Path) -> Columns:
         raise InputError(f"{file}: cannot be read: {error}; save it as UTF-8") from error
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    points: list[Point] = next(filter(None, reader.points.values()), [])
+    parts = next(filter(None, ([part for part in found if part] for found in reader.parts.values())), [])
+    points = [point for part in parts for point in part]
     points = [p for i, p in enumerate(points) if i == 0 or p[1:3] != points[i - 1][1:3]]
     if len(points) < LEAST_ROWS:
         raise InputError(f"{file}: has {len(points)} points of a track or a route, must have at least {LEAST_ROWS}")
     lines = tuple(point[0] for point in points)
-    columns = {"latitude_deg": 1, "longitude_deg": 2} | ({"altitude_m": 3} if all(p[3] for p in points) else {})
+    columns = {"latitude_deg": 1, "longitude_deg": 2}
     values = {name: tuple(_number(file, p, p[field], name) for p in points) for name, field in columns.items()}
+    _check_joined(file, parts)
+    if 2 * sum(bool(p[3]) for p in points) > len(points):
+        values["altitude_m"] = tuple(_number(file, p, p[3], "altitude_m") if p[3] else nan for p in points)
     return Columns(file, lines, values)
+
+
+def _check_joined(file: Path, parts: list[list[Point]]) -> None:
+    """Refuse parts of which one begins elsewhere than the one before ends."""
+    for before, after in pairwise(parts):
+        (south, west), (north, east) = ((float(p[1]), float(p[2])) for p in (before[-1], after[0]))
+        across = ((east - west + 180) % 360 - 180) * cos(radians((south + north) / 2))
+        gap = EARTH * radians(hypot(north - south, across))
+        if gap > JOINED:
+            many = f"has {len(parts)} tracks or segments, which do not join: {gap / 1000:.1f} km lie before this one"
+            raise InputError(f"{file}:{after[0][0]}: {many}; keep the one that is the road")
 
 
 def _number(file: Path, point: Point, text: str | int, name: str) -> float:

@@ -10,6 +10,7 @@ between points shows as a longer and gentler one.
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
@@ -19,10 +20,13 @@ from gz_onboard.errors import InputError
 from gz_onboard.routes.columns import UNITS, Columns
 from gz_onboard.routes.gpx import read_road
 
+_LOG = logging.getLogger(__name__)
+
 GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
 _CHORD = 10.0  # [m]: shorter chords have no heading worth the name
 _STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
+_STEP, _LEAP = 0.3, 5.0  # of the way, and m: by more the height of the next point does not differ
 _CLOSEST = 0.01  # [m] between positions
 _SHORTEST = 0.001  # [m] between distances: none is too short to be ridden in a time above 0
 _LIMITS = {f"speed_limit_{unit}": UNITS[unit] for unit in ("mps", "kmh")}
@@ -102,22 +106,14 @@ def route_ahead_of(columns: Columns, name: str) -> Route:
 
 def route_of(columns: Columns, name: str, altitude_needed: bool = True) -> Route:
     """The route in `columns`, as `read_route`; without altitudes it is level, if they are not needed."""
+    columns = without_holes(columns)
     values = columns.values
     if "altitude_m" in values:
         columns.check("altitude_m", -500.0, 9000.0, "m")
     elif altitude_needed:
         raise InputError(f"{columns.file}: column altitude_m is missing")
     positions = _positions(columns)
-    if "distance_m" in values:
-        columns.increasing("distance_m", "m")
-        for row, (before, after) in enumerate(pairwise(values["distance_m"]), start=1):
-            if after - before < _SHORTEST:
-                raise columns.error(row, f"distance_m: {after:g} m is less than {_SHORTEST:g} m from the point before")
-        distance = tuple(d - values["distance_m"][0] for d in values["distance_m"])
-    elif positions:
-        distance = _lengths(positions)
-    else:
-        raise InputError(f"{columns.file}: needs column distance_m, or latitude_deg and longitude_deg")
+    distance = _distance(columns, positions)
     if positions:
         _check_moving(columns, positions, distance)
     heading, curvature = _course(columns, positions, distance)
@@ -125,7 +121,9 @@ def route_of(columns: Columns, name: str, altitude_needed: bool = True) -> Route
     grade = _slopes(distance, values["altitude_m"], distance, GRADE_LENGTH) if "altitude_m" in values else level
     for row, sine in enumerate(grade):
         if abs(sine) > _STEEPEST:
-            raise columns.error(row, f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are distances in m?")
+            raise columns.error(
+                row, f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are heights and distances in m?"
+            )
     return Route(
         name,
         distance,
@@ -137,6 +135,58 @@ def route_of(columns: Columns, name: str, altitude_needed: bool = True) -> Route
         values.get("longitude_deg", ()),
         grade_known="altitude_m" in values,
     )
+
+
+def without_holes(columns: Columns) -> Columns:
+    """With the heights that are missing, or that leap alone, taken from their neighbours; a warning says which."""
+    heights = columns.values.get("altitude_m", ())
+    distance = _distance(columns, _positions(columns)) if heights else ()
+    holes = _holes(distance, heights)
+    if not holes:
+        return columns
+    import numpy as np
+
+    there = [row for row in range(len(heights)) if row not in holes]
+    filled = np.interp(distance, [distance[row] for row in there], [heights[row] for row in there])
+    said = f"{len(holes)} of {len(heights)} heights are missing or leap, the first here: filled from their neighbours"
+    _LOG.warning("%s:%d: %s", columns.file, columns.lines[min(holes)], said)
+    return replace(columns, values=columns.values | {"altitude_m": tuple(filled.tolist())})
+
+
+def _holes(distance: tuple[float, ...], heights: tuple[float, ...]) -> set[int]:
+    """The rows whose height is not a number, is beside a step that no road has, alone, or is 0 there."""
+    missing = {row for row, height in enumerate(heights) if math.isnan(height)}
+    runs = _runs(distance, heights, missing)
+    lone = {row for run in runs if len(run) == 1 or not any(heights[r] for r in run) for row in run}
+    agree = len(runs) > 1 and len(_runs(distance, heights, missing | lone)) == 1
+    return missing | lone if agree and 2 * len(lone) < len(heights) else missing
+
+
+def _runs(distance: tuple[float, ...], heights: tuple[float, ...], without: set[int]) -> list[list[int]]:
+    """Rows from one step to the next that no road has."""
+    runs: list[list[int]] = []
+    for row, height in enumerate(heights):
+        if row in without:
+            continue
+        last = runs[-1][-1] if runs else row
+        if not runs or abs(height - heights[last]) > _STEP * (distance[row] - distance[last]) + _LEAP:
+            runs.append([])
+        runs[-1].append(row)
+    return runs
+
+
+def _distance(columns: Columns, positions: list[tuple[float, float]]) -> tuple[float, ...]:
+    """Of each point from the first [m]."""
+    given = columns.values.get("distance_m")
+    if given:
+        columns.increasing("distance_m", "m")
+        for row, (before, after) in enumerate(pairwise(given), start=1):
+            if after - before < _SHORTEST:
+                raise columns.error(row, f"distance_m: {after:g} m is less than {_SHORTEST:g} m from the point before")
+        return tuple(d - given[0] for d in given)
+    if positions:
+        return _lengths(positions)
+    raise InputError(f"{columns.file}: needs column distance_m, or latitude_deg and longitude_deg")
 
 
 def _positions(columns: Columns) -> list[tuple[float, float]]:

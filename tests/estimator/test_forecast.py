@@ -119,6 +119,52 @@ def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
     assert forecast(unseen).consumption == pytest.approx(forecast(seen).consumption, rel=0.2)
 
 
+def roll(f, kilometres, grade, seed=0, drift=0.0, drive=0.0):
+    """Roll at 8 m/s with the motor off, or as if with `drive` [W]; `drift`: sd of the error of the grade shown."""
+    rng, error = np.random.default_rng(seed), 0.0
+    for i in range(round(kilometres * 1000 / 0.8)):
+        if i % 600 == 0:  # for half a kilometre
+            error = drift * rng.standard_normal()
+        f.ride(0.1, 8.0, grade + error, 45.0, AIR, drive=drive)
+
+
+@pytest.mark.parametrize("tows", [1, 3])
+def test_metres_that_something_else_paid_for_teach_nothing(tows):
+    f, never_towed = forecaster(), forecaster()
+    for each in f, never_towed:
+        ride(each, 8)
+    for _ in range(tows):
+        roll(f, 3, grade=0.0)
+        for each in f, never_towed:
+            ride(each, 2, seed=1)
+    towed, usual = forecast(f), forecast(never_towed)
+    assert towed.range == pytest.approx(usual.range, rel=0.01)
+    assert towed.p10 == pytest.approx(usual.p10, rel=0.02)
+    assert towed.p90 == pytest.approx(usual.p90, rel=0.02)
+    assert f.factor == pytest.approx(never_towed.factor, rel=0.01)
+
+
+def test_a_tow_takes_nothing_off_the_range_shown():
+    f = forecaster()
+    ride(f, 8)
+    before = f.shown(forecast(f)).range
+    for _ in range(30):
+        roll(f, 0.1, grade=0.0)
+        shown = f.shown(forecast(f))
+    assert shown.range == pytest.approx(before, abs=500)
+    assert not f.riding.segments[-1].measured < 1000  # none of the tow
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.008])
+def test_rolling_down_a_known_hill_is_still_riding(drift):
+    f, driven = forecaster(), forecaster()
+    for each, drive in (f, 0.0), (driven, 1000.0):
+        ride(each, 8)
+        roll(each, 4, grade=-0.0262, drift=drift, drive=drive)  # as much as keeps the speed
+    assert len(f.riding.segments) > 45
+    assert f.riding.usual == driven.riding.usual
+
+
 def test_who_rides_in_mountains_has_a_wider_interval_over_a_restart_too():
     """Up and down by 3 % for 4 km each, against a plain; the median expects neither."""
     plain, mountains = forecaster(), forecaster()

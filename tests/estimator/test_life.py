@@ -506,6 +506,26 @@ def test_a_charge_that_pauses_says_no_time_until_full():
     _, row = follow(e, scooter.live(5, charge=0.9), scooter)[-1]  # plugged in, and nothing flows into the pack
     assert row.activity is Activity.CHARGING
     assert row.time_to_full is None
+    _, row = follow(e, scooter.live(65, charge=0.9), scooter)[-1]
+    assert row.activity is Activity.PARKED
+    assert row.range_full is None
+
+
+@pytest.mark.parametrize("shown", [1.0, 3.0], ids=["plugged in", "not available"])
+def test_a_plug_without_a_current_is_no_charge(shown):
+    scooter, e = Scooter(soc=0.17), estimator()
+    told = ((t, g, (v[0], shown) if g == OTHERS else v) for t, g, v in scooter.live(200))
+    rows = follow(e, told, scooter)
+    assert {row.activity for _, row in rows[2:]} == {Activity.PARKED}
+    assert rows[-1][1].range_full is None
+
+
+def test_a_plug_is_believed_where_no_current_is_known():
+    scooter, e = Scooter(soc=0.17), estimator([GROUPS[MOTOR], GROUPS[OTHERS]])
+    for t, group, values in scooter.live(200):
+        if group in (MOTOR, OTHERS):
+            e.handle((t, int(group == OTHERS), (values[0], 1.0) if group == OTHERS else values))
+    assert e.estimate(t).activity is Activity.CHARGING
 
 
 @pytest.mark.parametrize("start", [0.2, 0.6])
@@ -579,3 +599,33 @@ def test_joined_mid_ride_it_says_so_until_a_rest_shows_the_state_of_charge():
     follow(e, scooter.live(3600), scooter)
     rows = follow(e, scooter.live(20, 11.0), scooter)
     assert rows[-1][1].activity is Activity.RIDING
+
+
+@pytest.mark.parametrize("leap", [200.0, 3000.0, 86_400.0])
+def test_a_clock_that_was_set_under_way_is_no_gap(leap):
+    """The odometer goes on, so nothing was missed."""
+
+    def ridden(leap):
+        scooter, e = Scooter(soc=0.8), estimator()
+        follow(e, scooter.live(20), scooter)
+        follow(e, scooter.live(420, 10.0), scooter)
+        scooter.time += leap
+        return e, follow(e, scooter.live(400, 10.0), scooter)[-1][1]
+
+    (e, end), (_, usual) = ridden(leap), ridden(0.0)
+    assert e.gap_time == 0.0
+    assert end.soc == pytest.approx(usual.soc, abs=0.001)
+    assert end.soc_sd == pytest.approx(usual.soc_sd, rel=0.05)
+    assert end.distance == pytest.approx(usual.distance, abs=30)
+    assert end.range == pytest.approx(usual.range, rel=0.01)
+    assert not end.reasons & ~usual.reasons
+
+
+@pytest.mark.parametrize("ridden", [10.0, 0.0])
+def test_a_gap_on_the_way_is_a_gap(ridden):
+    scooter, e = Scooter(soc=0.8), estimator()
+    follow(e, scooter.live(20), scooter)
+    follow(e, scooter.live(400, 10.0 if ridden else 0.0), scooter)
+    scooter.away(600, ridden)
+    follow(e, scooter.live(100, 10.0), scooter)
+    assert e.gap_time == pytest.approx(600, abs=5)

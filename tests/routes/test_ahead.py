@@ -34,11 +34,63 @@ def test_a_gpx_is_read(tmp_path, kind):
     assert route.latitude[5] == pytest.approx(47.001)
 
 
-def test_without_all_altitudes_it_is_level_and_says_so(tmp_path):
-    points = [(47.0 + 0.0002 * i, 8.0, None if i == 7 else 400.0 + i) for i in range(40)]
+def test_without_most_altitudes_it_is_level_and_says_so(tmp_path):
+    points = [(47.0 + 0.0002 * i, 8.0, None if i % 2 else 400.0 + i) for i in range(40)]
     route = read_ahead(gpx(tmp_path, points))[1]
     assert not route.grade_known
     assert set(route.grade) == {0.0}
+
+
+@pytest.mark.parametrize("held", [None, 0.0, 90.0, -9999.0])
+@pytest.mark.parametrize("rows", [[0], [7], [39], [3, 20], [0, 1, 2], [19, 20, 21]])
+def test_a_hole_in_the_heights_is_filled_and_said(tmp_path, caplog, held, rows):
+    """A run of zeros is one, too; of other heights that would be a road of its own."""
+    rows = rows if held in (None, 0.0) else [*rows[:1], *rows[3:]]
+    points = [(47.0 + 0.0002 * i, 8.0, held if i in rows else 142.0 + 0.5 * i) for i in range(40)]
+    columns, route = read_ahead(gpx(tmp_path, points))
+    assert route.grade_known
+    assert route.grade == pytest.approx([0.5 / 22.236] * 40, abs=0.008)
+    assert columns.values["altitude_m"][19] == pytest.approx(151.5, abs=2)
+    line = 3 + rows[0]
+    assert f"way.gpx:{line}: {len(rows)} of 40 heights are missing or leap" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "heights", [[0.0] * 20, [0, 0, 0, 4, 6, 8, 9, 9, 3, 0, 0], [100, 102, 99, 103, 100], [0, 8, 0]]
+)
+def test_heights_of_a_road_are_left_alone(tmp_path, caplog, heights):
+    points = [(47.0 + 0.0002 * i, 8.0, z) for i, z in enumerate(heights)]
+    assert read_ahead(gpx(tmp_path, points))[0].values["altitude_m"] == tuple(heights)
+    assert not caplog.text
+
+
+PART = [(47.0 + 0.0002 * i, 8.0, 400.0) for i in range(20)]
+AROUND = {"tracks": "</trkseg></trk><trk><trkseg>", "segments": "</trkseg><trkseg>", "routes": "</rte><rte>"}
+
+
+def in_two(folder, first, second, around):
+    """A GPX of two parts."""
+    kind = "rtept" if around == "routes" else "trkpt"
+    file = gpx(folder, [*first, *second], kind)
+    lines = file.read_text().splitlines()
+    lines[2 + len(first)] = AROUND[around] + lines[2 + len(first)]
+    file.write_text("\n".join(lines))
+    return file
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_parts_that_do_not_join_are_refused(tmp_path, around):
+    away = [(y + 0.03, x, z) for y, x, z in PART]
+    told = r"way\.gpx:23: has 2 tracks or segments, which do not join: 2\.9 km lie before this one"
+    with pytest.raises(InputError, match=told):
+        read_ahead(in_two(tmp_path, PART, away, around))
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_parts_that_join_are_one_road(tmp_path, around):
+    on = [(y + 0.0043, x, z) for y, x, z in PART]  # 56 m further on
+    route = read_ahead(in_two(tmp_path, PART, on, around))[1]
+    assert route.length == pytest.approx(0.0081 * 111_180, rel=1e-3)
 
 
 def test_a_track_that_stood_is_passed_over(tmp_path):

@@ -7,7 +7,7 @@ from gz_onboard.estimator.redundancy.checks import SensorCheck, StepInputs
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
 from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.inertial import InertialCheck
-from gz_onboard.estimator.redundancy.motion import MotionCheck
+from gz_onboard.estimator.redundancy.motion import CarriedCheck, MotionCheck
 from gz_onboard.estimator.redundancy.odometer import OdometerCheck
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.redundancy.temperatures import TemperatureCheck
@@ -31,6 +31,7 @@ class Redundancy:
         self.currents, self.voltages = CurrentCheck(capacity), VoltageCheck(battery, capacity)
         self._checks: tuple[SensorCheck, ...] = (
             TemperatureCheck(),
+            CarriedCheck(capacity),
             self.speeds,
             self.odometer,
             MotionCheck(self.speeds, capacity),
