@@ -10,7 +10,15 @@ from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, Noise, SocFilter
 from gz_onboard.estimator.gate import InnovationGate
-from gz_onboard.estimator.initial import DROP_FACTOR, Situation, SteadyVoltage, first_filter
+from gz_onboard.estimator.initial import (
+    DROP_FACTOR,
+    START_WAIT,
+    STEADY_AFTER,
+    STEADY_TIME,
+    Situation,
+    SteadyVoltage,
+    first_filter,
+)
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
@@ -67,8 +75,9 @@ class StateOfCharge:
         self._auxiliary_power = model.parameters["auxiliary_power"]
         self._steady = SteadyVoltage(battery)
         self._rest = RestUpdate(battery, self.uncertainty, self.effects)
-        self._odometer: float | None = None  # m, at the last step
-        self._own_soc: float | None = None  # the vehicle's own state of charge, at the last step
+        # At the last step, with what was ridden and drawn since it came last:
+        self._odometer: float | None = None  # m
+        self._own_soc: float | None = None  # the vehicle's own state of charge
         self._started = -inf  # s: when there was a first state of charge,
         self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
         self._doubted = False  # a voltage
@@ -167,14 +176,16 @@ class StateOfCharge:
             "v1": filter_.v1,
             "covariance": list(filter_.covariance),
             "current": self.current,
-            "odometer": self._signals.odometer.last,
-            "own_soc": self._signals.bms_state_of_charge.last,
+            "odometer": self._odometer,
+            "own_soc": self._own_soc,
             "cell_effects": dict(self.effects.states),
         }
 
     def restore(self, saved: Saved | None, age: float | None, effects: dict[str, float]) -> None:
         """Go on from what is `age` [s] old, if anything; effects: their states [V of a cell]."""
         self.saved, self.saved_age = saved, age
+        if saved:
+            self._signals.resume({"odometer": saved.odometer, "bms_state_of_charge": saved.own_soc})
         self._unseen = STOOD if saved is None or age is None else min(age, STOOD)
         self.effects.restore(effects, age, saved.soc if saved else 0.0)
 
@@ -196,7 +207,7 @@ class StateOfCharge:
         if dt > 0:
             self._predict(filter_, now, dt, pack, riding)
         self.current = current
-        self._odometer, self._own_soc = self._signals.odometer.last, self._signals.bms_state_of_charge.last
+        self._follow_told(now, dt, pack.speed)
         if voltage is None or current is None:
             self.gate.innovation = None
             return
@@ -215,6 +226,15 @@ class StateOfCharge:
             voltage, current = pair
         self._update(filter_, now, dt, (voltage, current), pack)
 
+    def _follow_told(self, now: float, dt: float, speed: float | None) -> None:
+        own_soc, odometer = self._signals.bms_state_of_charge, self._signals.odometer
+        if own_soc.fresh(now):
+            self._own_soc = own_soc.value
+        if odometer.fresh(now):
+            self._odometer = odometer.value
+        elif self._odometer is not None:
+            self._odometer += abs(speed or 0.0) * dt
+
     def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
@@ -230,6 +250,8 @@ class StateOfCharge:
         if dt > pause or (counted is CurrentSource.NONE and pack.reading.unmeasured):
             q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
             self._rest.interrupt()
+        if self._own_soc is not None:
+            self._own_soc -= mean * dt / charge
         before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         self.ageing.count(filter_, before, mean * dt / charge)
@@ -326,8 +348,9 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        least = STEADY_AFTER if self.saved and self._signals.doubted else START_WAIT if missing else STEADY_TIME
         battery = self._battery
-        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, missing)
+        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, least)
         if found is None:
             return
         first, unsteady_sd = found
