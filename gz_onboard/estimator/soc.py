@@ -23,7 +23,7 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
-from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible, uncounted_sd
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -33,6 +33,7 @@ DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the firs
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 JOINED = 900.0  # s: how long ago a ride began that is joined under way, for all that is known
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
+NOTHING_FOR = 60.0  # s: a current that reads exactly 0 for longer may be any small one
 SHORTEST = 0.02  # s: a step, to divide by
 
 
@@ -86,6 +87,7 @@ class StateOfCharge:
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
+        self._nothing = 0.0  # s for which the current has read 0
         self.another_pack = False  # whether this step has shown it to be another than it was
 
     # --- what others ask --------------------------------------------------------------------------------------
@@ -248,8 +250,11 @@ class StateOfCharge:
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
         if dt > pause or (counted is CurrentSource.NONE and pack.reading.unmeasured):
-            q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
+            q += self._charge.one_way(uncounted_sd(dt), sqrt(filter_.covariance[0]))
             self._rest.interrupt()
+        elif self._shows_nothing(now, dt, pack.reading):
+            load = self._auxiliary_power / (pack.reading.voltage or self.rest_voltage)
+            q += self._charge.one_way(load * dt / charge, sqrt(filter_.covariance[0]))
         if self._own_soc is not None:
             self._own_soc -= mean * dt / charge
         before = filter_.covariance
@@ -261,6 +266,13 @@ class StateOfCharge:
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
+
+    def _shows_nothing(self, now: float, dt: float, reading: PackReading) -> bool:
+        """Whether the current has read exactly 0 for long: many sensors show small currents, as of what is on, so."""
+        shown, closed = self._signals.pack_current, self._signals.contactor.get(now) != 0
+        nothing = reading.source is CurrentSource.PACK and shown.value == 0.0 and closed
+        self._nothing = self._nothing + dt if nothing else 0.0
+        return self._nothing > NOTHING_FOR
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""

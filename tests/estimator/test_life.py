@@ -633,3 +633,18 @@ def test_joined_mid_ride_it_says_so_until_a_rest_shows_the_state_of_charge():
     follow(e, scooter.live(3600), scooter)
     rows = follow(e, scooter.live(20, 11.0), scooter)
     assert rows[-1][1].activity is Activity.RIDING
+
+
+@pytest.mark.parametrize("make", [Scooter, flat_pack])
+def test_a_current_that_shows_nothing_while_the_bus_is_awake_is_no_better_known_than_the_load(make):
+    """Many sensors show small currents as 0; of a pack with a flat voltage nothing corrects it."""
+    scooter = make(soc=0.9, offset=0.0)
+    e = estimator(vehicle=scooter.vehicle)
+    follow(e, scooter.live(30), scooter)
+    follow(e, scooter.live(300, 10.0), scooter)
+    knows(e, scooter)
+    scooter.period = 1.0
+    events = ((t, g, (v[0], 0.0, None) if g == PACK else v) for t, g, v in scooter.live(5 * 3600) if g != INVERTER)
+    rows = follow(e, events, scooter)
+    assert worst(rows) < 1.3
+    assert rows[100][1].soc_sd < 0.2 * rows[-1][1].soc_sd or make is Scooter
