@@ -23,7 +23,7 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
-from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible, uncounted_sd
+from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, limited, plausible, uncounted_sd
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -174,7 +174,7 @@ class StateOfCharge:
     def snapshot(self, filter_: SocFilter) -> dict[str, object]:
         """What is to be kept over a restart."""
         return {
-            "soc": filter_.soc,
+            "soc": min(max(filter_.soc, 0.0), 1.0),
             "v1": filter_.v1,
             "covariance": list(filter_.covariance),
             "current": self.current,
@@ -260,9 +260,7 @@ class StateOfCharge:
         before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         self.ageing.count(filter_, before, mean * dt / charge)
-        p00, p01, p11 = filter_.covariance
-        if p00 > SOC_UNKNOWN_SD**2:
-            filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
+        filter_.covariance = limited(filter_.covariance)
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
