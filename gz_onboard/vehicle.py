@@ -165,7 +165,10 @@ def read_vehicle(
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table, effects_folder, users)
     parameters = read_parameters(table, effects)
-    model, riding = Model(effects, parameters), read_riding(table)
+    model, derating = Model(effects, parameters), read_derating(table)
+    spin = derating.top_spin
+    top_speed = spin and spin * parameters["wheel_radius"] / parameters["gear_ratio"]
+    riding = read_riding(table, model, top_speed)
     check_riding(table, riding, model)
     vehicle = Vehicle(
         name=_name(table),
@@ -175,7 +178,7 @@ def read_vehicle(
         battery=read_battery(table, parameters) if "battery" in table.values else None,
         model=model,
         riding=riding,
-        derating=read_derating(table),
+        derating=derating,
         range_dbc=_range_dbc(table),
         range_identifier=_range_identifier(table),
         healthy=_healthy(table.table("healthy")),

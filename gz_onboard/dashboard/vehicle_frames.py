@@ -15,6 +15,7 @@ from pathlib import Path
 from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.estimator.signals import LEAPS, Told
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating
 from gz_onboard.vehicle import Vehicle
@@ -27,9 +28,7 @@ LATE_PERIODS = 3
 PERIOD = 1.0  # s, where nothing says it
 RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the vehicle file says nothing
 CHARGING = 0.0, 45.0  # degC: likewise
-FASTEST, LEAP = 0.07, 100.0  # km/s and km: an odometer that goes further ahead, or goes back, is doubted
-DOUBTED = 10.0  # s: one that errs for so long was set
-MOST_OF_A_DAY = 86_400 * FASTEST  # km
+MOST_OF_A_DAY = 86_400 * LEAPS[ODOMETER][2]  # m
 CLOCK_SET = 10**18  # ns since 1970: earlier says the clock of a board that begins with 1970 and was not told the time
 
 
@@ -66,7 +65,7 @@ class VehicleFrames:
             for role, value in zip(group.roles, values, strict=True):
                 if value is None or not self._believed:
                     continue
-                if role != ODOMETER or self._day.take(value / 1e3, frame[0], now):
+                if role != ODOMETER or self._day.take(value, frame[0], now):
                     self._last[role] = value, now
 
     @property
@@ -126,49 +125,39 @@ class Day:
 
     def __init__(self, kept: Path | None, vehicle: str) -> None:
         self._kept, self._vehicle = kept, vehicle
-        self._date, self._begin = _read(kept, vehicle) if kept else ("", 0.0)  # of the day; the odometer [km] then
-        self._last: tuple[float, float] | None = None  # km, and when [s]
-        self._doubt: float | None = None  # s: since when it is doubted
+        self._date, self._begin = _read(kept, vehicle) if kept else ("", 0.0)  # of the day; the odometer [m] then
+        self._last: float | None = None  # m
+        self._told = Told(ODOMETER)
+        if self._begin:
+            self._told.said = self._begin, -inf
         self._clock_set = False
 
     @property
     def ridden(self) -> float | None:
         """[km]; None before the odometer was seen, and while nobody knows which day it is."""
-        return self._last[0] - self._begin if self._last and self._clock_set else None
+        return (self._last - self._begin) / 1e3 if self._last is not None and self._clock_set else None
 
     def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
-        """The odometer [km] at a time [ns since 1970], which came at `now` [s]; False if it is not believed.
-
-        Its ECU may say 0 until it has found what it kept: of that no day is made.
-        """
-        if self._possible(odometer, now):
-            self._doubt = None
-        else:
-            self._doubt = now if self._doubt is None else self._doubt
-            if now - self._doubt < DOUBTED:
-                return False
-            self._date, self._last, self._doubt = "", None, None
+        """The odometer [m] at a time [ns since 1970], which came at `now` [s]; False if it is not believed."""
+        if not self._told.believes(odometer, now):
+            return False
+        if self._told.anew:
+            self._date, self._last = "", None
         self._clock_set = stamp_ns >= CLOCK_SET
         if not self._clock_set:
-            self._last = self._last or (odometer, now)  # what is ridden until then counts for the day that it will be
+            self._last = self._last or odometer  # what is ridden until then counts for the day that it will be
             return True
         date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
         if date != self._date or odometer - self._begin > MOST_OF_A_DAY:
-            self._date, self._begin = date, self._last[0] if self._last else odometer
+            self._date, self._begin = date, self._last or odometer
             if self._kept:
                 self._keep(self._kept)
-        self._last = odometer, now
+        self._last = odometer
         return True
-
-    def _possible(self, odometer: float, now: float) -> bool:
-        if self._last is None:
-            return odometer >= self._begin
-        before, then = self._last
-        return 0 <= odometer - before <= LEAP + FASTEST * (now - then)
 
     def _keep(self, file: Path) -> None:
         new = file.with_name(f"{file.name}.new")
-        day = {"vehicle": self._vehicle, "date": self._date, "odometer_km": round(self._begin, 3)}
+        day = {"vehicle": self._vehicle, "date": self._date, "odometer_km": round(self._begin / 1e3, 3)}
         try:
             new.write_text(json.dumps(day), encoding="utf-8")
             new.replace(file)
@@ -177,10 +166,10 @@ class Day:
 
 
 def _read(file: Path, vehicle: str) -> tuple[str, float]:
-    """Date and odometer [km] in the file; of one that is damaged, not there or another's a day that never was."""
+    """Date and odometer [m] in the file; of one that is damaged, not there or another's a day that never was."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-        date, odometer, of = str(found["date"]), float(found["odometer_km"]), found["vehicle"]
+        date, odometer, of = str(found["date"]), 1e3 * float(found["odometer_km"]), found["vehicle"]
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return "", 0.0
     return (date, odometer) if of == vehicle and 0 <= odometer < inf else ("", 0.0)

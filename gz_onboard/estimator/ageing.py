@@ -37,7 +37,7 @@ from gz_onboard.estimator.interval import DECILE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
-from gz_onboard.physics.battery import QUICK, Battery
+from gz_onboard.physics.battery import MOST_SOC_SD, QUICK, Battery
 
 CAPACITY = 0.5, 1.1  # factors that a pack at work has
 CAPACITY_SD = 0.16  # of ψ, of packs that are not as new
@@ -141,7 +141,8 @@ class Ageing:
     def state_of_charge(self, filter_: SocFilter) -> tuple[float, float]:
         """(SOC, its sd) with what is believed of the capacity."""
         belief = self.belief
-        return filter_.soc + belief.soc_shift, sqrt(max(filter_.covariance[0] + belief.soc_variance, LEAST_SOC))
+        sd = sqrt(max(filter_.covariance[0] + belief.soc_variance, LEAST_SOC))
+        return filter_.soc + belief.soc_shift, min(sd, MOST_SOC_SD)
 
     def as_believed(self, error: float, own: float, slope: float) -> tuple[float, float]:
         """A voltage's error [V] and the variance of what the filter expects [V²], as the capacity is believed to be.

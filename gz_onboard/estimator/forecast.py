@@ -26,8 +26,9 @@ from gz_onboard.constants import GRAVITY, HOUR
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.auxiliaries import Auxiliaries
+from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.calm import Calm, restored_calm
-from gz_onboard.estimator.interval import deciles
+from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states, unlearned
@@ -53,7 +54,7 @@ LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 DRIVES = 0.003  # of the weight: a motor that takes less does not drive; tyres alone take three times as much
 HEIGHTS_ERR = 3.0  # m: so much a climb may be wrong where it is to explain how a vehicle moves without its motor
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
-MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
+MOST_SD = 1.0  # of the logarithm of the range: beyond, it is not known at all
 COLDER_AGAIN = 0.005, 0.5, 0.5, 20.0  # SOC, degC, degC, W: changed by more, what colder cells lack is asked anew
 
 
@@ -90,6 +91,7 @@ class Expected:
     power: float  # W, mean
     form_factor_squared: float  # mean square of the power over the square of its mean
     variance: float  # of the consumption over the way to come, relative
+    least: float  # J/m: no riding takes less
 
     @property
     def load(self) -> tuple[float, float]:
@@ -216,10 +218,11 @@ class Forecaster:
         """`forecast` as it is to be shown; to be asked once for each; drawn: see `Calm.follow`.
 
         P10 and P90 are those of the newest forecast, since what it has just learned must be in them; they hold the
-        range shown, too.
+        range shown, too: where that falls towards P10, P10 stays below it.
         """
         way = self.calm.follow(forecast.range, forecast.energy, forecast.known_from, drawn)
-        return replace(forecast, range=way, p10=min(forecast.p10, way), p90=max(forecast.p90, way))
+        below = sqrt(forecast.p10 / forecast.range) if forecast.range else 0.0
+        return replace(forecast, range=way, p10=min(forecast.p10, way * below), p90=max(forecast.p90, way))
 
     @property
     def recent_factor(self) -> float:
@@ -322,7 +325,7 @@ class Forecaster:
         return Forecast(
             range=range_,
             p10=p10 / consumption,
-            p90=p90 / consumption,
+            p90=min(p90 / consumption, (left.energy + DECILE * upwards) / expected.least),
             left=left,
             energy_sd=energy_sd,
             energy_sd_up=upwards,
@@ -380,6 +383,7 @@ class Forecaster:
             form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
             variance=((variance + standing_variance) * moving**2 + pace_variance * beside**2) / consumption**2
             + height_variance,
+            least=LEAST * moving,
         )
 
     # --- saving -----------------------------------------------------------------------------------------------
@@ -393,6 +397,7 @@ class Forecaster:
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
+        within("riding", saved)
         unit = restored_unit(saved, self._unit)
         riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)

@@ -8,7 +8,7 @@ from math import exp, hypot, inf, sqrt
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.start import Saved, bounded, from_voltage, parked, uncounted, update_soc
+from gz_onboard.estimator.start import Saved, bounded, from_voltage, limited, parked, uncounted, update_soc
 from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
@@ -64,12 +64,12 @@ class SteadyVoltage:
         temperature: float,
         speed: float | None,
         pause: float,
-        missing: bool,
+        least: float,
     ) -> tuple[First, float] | None:
         """(the first of the voltages that hold still, sd of a cell's from its movement [V]); None while too short.
 
         voltage [V], current [A]: of the pack; temperature: of the cells [degC]; pause: a gap that is longer [s] begins
-        anew; missing: something that comes once a second has not come yet.
+        anew; least: for so long [s] it must hold still.
         """
         if self._first is None or now - self._looked > max(2 * START_WAIT, pause):
             self._first = First(now, voltage, current)
@@ -83,8 +83,7 @@ class SteadyVoltage:
         if moved > STEADY_SHARE * self._span and not late:
             self._first, self._unsteady = First(now, voltage, current), True
             return None
-        least = STEADY_AFTER if self._unsteady else START_WAIT if missing else STEADY_TIME
-        if now - first.time < least and not late:
+        if now - first.time < (STEADY_AFTER if self._unsteady else least) and not late:
             return None
         self._waited, self._unsteady = inf, False
         return first, self._span if late else STEADY_SD * moved
@@ -166,5 +165,6 @@ def first_filter(
         else:
             counted = before, variance
         update_soc(filter_, before, variance)
+        filter_.covariance = limited(filter_.covariance)
     filter_.soc = bounded(filter_.soc)
     return filter_, counted

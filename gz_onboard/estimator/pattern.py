@@ -124,7 +124,8 @@ def restored_pattern(saved: Iterable[Sequence[float]]) -> Pattern:
         key = int(speed), int(acceleration)
         moving = key != _STANDING
         plausible = all(isfinite(x) and abs(x) < MOST_SUM for x in b.sums()) and 0 < b.time < inf
-        if not plausible or (moving and not (b.distance > 0 and b.cubes > 0)) or min(b.hills, b.lateral) < 0:
+        plausible &= 0 <= b.hills <= STEEPEST**2 * b.distance * (1 + 1e-9) and b.lateral >= 0
+        if not plausible or (moving and not (b.distance > 0 and b.cubes > 0)):
             raise ValueError("implausible pattern of the riding")
         pattern.bins[key] = b
     if len(pattern.bins) > MOST_BINS:

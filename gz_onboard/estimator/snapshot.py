@@ -5,25 +5,23 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any
 
 from gz_onboard.errors import shown
 from gz_onboard.estimator.ageing import Ageing
+from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.road import MOST_BIAS
-from gz_onboard.estimator.start import Saved
+from gz_onboard.estimator.start import SOC_UNKNOWN_SD, Saved
 from gz_onboard.estimator.weakest import Weakest
 
 VERSION = (
     3  # 2: the states of effects with memory; 3: odometer, own SOC and consumption, for the charge that flows uncounted
 )
-MOST = {"current": 1e4, "odometer": 1e10, "own_soc": 1.1, "consumption": 1e5}  # A, m, 1, J/m
-SOC = -0.1, 1.1
-V1 = 1.0  # V of a cell
 CELLS = -50.0, 120.0  # degC
+OPTIONAL = "current", "odometer", "own_soc", "consumption"  # where the vehicle does not tell it
 NAMED = 3  # effects in a message
 CELLS_KEEP = 3600.0  # s: for so long the cells' temperature is known
 
@@ -183,31 +181,17 @@ def _charge(saved: Mapping[str, Any], effects: CellEffects) -> tuple[Saved | Non
     with part("charge"):
         if saved["soc"] is None and saved["covariance"] is None:  # `mended`
             return None, {}
-        return _battery(saved), effects.read(saved["cell_effects"])
+        optional = {name: None if saved[name] is None else float(saved[name]) for name in OPTIONAL}
+        p00, p01, p11 = (float(x) for x in saved["covariance"])
+        known = Saved(float(saved["soc"]), float(saved["v1"]), (p00, p01, p11), **optional)
+        within("charge", asdict(known))
+        if not (0 < p00 <= SOC_UNKNOWN_SD**2 and 0 < p11 < 1 and p01 * p01 <= p00 * p11):
+            raise ValueError("a covariance that cannot be")
+        return known, effects.read(saved["cell_effects"])
 
 
 def _biases(saved: Mapping[str, Any]) -> tuple[float, float]:
     with part("gyro bias"):
+        within("gyro_bias", saved["gyro_bias"])
         bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
-        if not (abs(bias_x) < MOST_BIAS and abs(bias_z) < MOST_BIAS):
-            raise ValueError("more than any gyroscope has")
     return bias_x, bias_z
-
-
-def _battery(saved: Mapping[str, Any]) -> Saved:
-    soc, v1 = float(saved["soc"]), float(saved["v1"])
-    p00, p01, p11 = (float(x) for x in saved["covariance"])
-    possible = SOC[0] < soc < SOC[1] and abs(v1) < V1 and 0 < p00 < 1 and 0 < p11 < 1 and p01 * p01 <= p00 * p11
-    if not possible:
-        raise ValueError("holds implausible numbers")
-    return Saved(soc, v1, (p00, p01, p11), **{name: _optional(saved[name], most) for name, most in MOST.items()})
-
-
-def _optional(value: object, most: float) -> float | None:
-    """A saved number, in size at most `most`, or None. ValueError, TypeError if it is neither."""
-    if value is None:
-        return None
-    number = float(value)  # type: ignore[arg-type]
-    if not abs(number) <= most:
-        raise ValueError("holds implausible numbers")
-    return number

@@ -10,12 +10,20 @@ from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, Noise, SocFilter
 from gz_onboard.estimator.gate import InnovationGate
-from gz_onboard.estimator.initial import DROP_FACTOR, Situation, SteadyVoltage, first_filter
+from gz_onboard.estimator.initial import (
+    DROP_FACTOR,
+    START_WAIT,
+    STEADY_AFTER,
+    STEADY_TIME,
+    Situation,
+    SteadyVoltage,
+    first_filter,
+)
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
-from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, limited, plausible, uncounted_sd
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -25,6 +33,7 @@ DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the firs
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 JOINED = 900.0  # s: how long ago a ride began that is joined under way, for all that is known
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
+NOTHING_FOR = 60.0  # s: a current that reads exactly 0 for longer may be any small one
 SHORTEST = 0.02  # s: a step, to divide by
 
 
@@ -67,8 +76,9 @@ class StateOfCharge:
         self._auxiliary_power = model.parameters["auxiliary_power"]
         self._steady = SteadyVoltage(battery)
         self._rest = RestUpdate(battery, self.uncertainty, self.effects)
-        self._odometer: float | None = None  # m, at the last step
-        self._own_soc: float | None = None  # the vehicle's own state of charge, at the last step
+        # At the last step, with what was ridden and drawn since it came last:
+        self._odometer: float | None = None  # m
+        self._own_soc: float | None = None  # the vehicle's own state of charge
         self._started = -inf  # s: when there was a first state of charge,
         self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
         self._doubted = False  # a voltage
@@ -77,6 +87,7 @@ class StateOfCharge:
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
+        self._nothing = 0.0  # s for which the current has read 0
         self.another_pack = False  # whether this step has shown it to be another than it was
 
     # --- what others ask --------------------------------------------------------------------------------------
@@ -163,18 +174,20 @@ class StateOfCharge:
     def snapshot(self, filter_: SocFilter) -> dict[str, object]:
         """What is to be kept over a restart."""
         return {
-            "soc": filter_.soc,
+            "soc": min(max(filter_.soc, 0.0), 1.0),
             "v1": filter_.v1,
             "covariance": list(filter_.covariance),
             "current": self.current,
-            "odometer": self._signals.odometer.last,
-            "own_soc": self._signals.bms_state_of_charge.last,
+            "odometer": self._odometer,
+            "own_soc": self._own_soc,
             "cell_effects": dict(self.effects.states),
         }
 
     def restore(self, saved: Saved | None, age: float | None, effects: dict[str, float]) -> None:
         """Go on from what is `age` [s] old, if anything; effects: their states [V of a cell]."""
         self.saved, self.saved_age = saved, age
+        if saved:
+            self._signals.resume({"odometer": saved.odometer, "bms_state_of_charge": saved.own_soc})
         self._unseen = STOOD if saved is None or age is None else min(age, STOOD)
         self.effects.restore(effects, age, saved.soc if saved else 0.0)
 
@@ -196,7 +209,7 @@ class StateOfCharge:
         if dt > 0:
             self._predict(filter_, now, dt, pack, riding)
         self.current = current
-        self._odometer, self._own_soc = self._signals.odometer.last, self._signals.bms_state_of_charge.last
+        self._follow_told(now, dt, pack.speed)
         if voltage is None or current is None:
             self.gate.innovation = None
             return
@@ -215,6 +228,15 @@ class StateOfCharge:
             voltage, current = pair
         self._update(filter_, now, dt, (voltage, current), pack)
 
+    def _follow_told(self, now: float, dt: float, speed: float | None) -> None:
+        own_soc, odometer = self._signals.bms_state_of_charge, self._signals.odometer
+        if own_soc.fresh(now):
+            self._own_soc = own_soc.value
+        if odometer.fresh(now):
+            self._odometer = odometer.value
+        elif self._odometer is not None:
+            self._odometer += abs(speed or 0.0) * dt
+
     def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
@@ -228,17 +250,27 @@ class StateOfCharge:
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
         if dt > pause or (counted is CurrentSource.NONE and pack.reading.unmeasured):
-            q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
+            q += self._charge.one_way(uncounted_sd(dt), sqrt(filter_.covariance[0]))
             self._rest.interrupt()
+        elif self._shows_nothing(now, dt, pack.reading):
+            load = self._auxiliary_power / (pack.reading.voltage or self.rest_voltage)
+            q += self._charge.one_way(load * dt / charge, sqrt(filter_.covariance[0]))
+        if self._own_soc is not None:
+            self._own_soc -= mean * dt / charge
         before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         self.ageing.count(filter_, before, mean * dt / charge)
-        p00, p01, p11 = filter_.covariance
-        if p00 > SOC_UNKNOWN_SD**2:
-            filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
+        filter_.covariance = limited(filter_.covariance)
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
+
+    def _shows_nothing(self, now: float, dt: float, reading: PackReading) -> bool:
+        """Whether the current has read exactly 0 for long: many sensors show small currents, as of what is on, so."""
+        shown, closed = self._signals.pack_current, self._signals.contactor.get(now) != 0
+        nothing = reading.source is CurrentSource.PACK and shown.value == 0.0 and closed
+        self._nothing = self._nothing + dt if nothing else 0.0
+        return self._nothing > NOTHING_FOR
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""
@@ -326,8 +358,9 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        least = STEADY_AFTER if self.saved and self._signals.doubted else START_WAIT if missing else STEADY_TIME
         battery = self._battery
-        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, missing)
+        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, least)
         if found is None:
             return
         first, unsteady_sd = found

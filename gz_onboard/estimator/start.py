@@ -51,6 +51,13 @@ def bounded(soc: float) -> float:
     return min(max(soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
 
 
+def limited(covariance: Covariance) -> Covariance:
+    """`covariance`, of a SOC that is no less known than not at all."""
+    p00, p01, p11 = covariance
+    share = min(SOC_UNKNOWN_SD / sqrt(p00), 1.0)
+    return (p00, p01, p11) if share == 1 else (SOC_UNKNOWN_SD**2, p01 * share, p11)
+
+
 def plausible(battery: Battery, emf: float) -> bool:
     """Whether a cell can have this voltage [V] without load: an inverter that is not yet charged shows a few volts."""
     empty, full = battery.ocv(0.0)[0], battery.ocv(1.0)[0]
@@ -125,8 +132,8 @@ def uncounted(
         gap = UNKNOWN_AGE  # it is so much longer than the clock says, or the odometer was reset
     mean, sd = 0.0, uncounted_sd(gap)
     if distance is not None and saved.consumption is not None:
-        if -ODOMETER_STEP <= distance <= FASTEST * gap + ODOMETER_STEP:
-            price = saved.consumption / (HOUR * charge * voltage)  # SOC per metre
+        price = saved.consumption / (HOUR * charge * voltage)  # SOC per metre
+        if -ODOMETER_STEP <= distance <= FASTEST * gap + ODOMETER_STEP and distance * price < 1:  # else charged, too
             mean = max(distance, 0.0) * price
             charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / HOUR
             step = min(ODOMETER_STEP, FASTEST * gap) * price

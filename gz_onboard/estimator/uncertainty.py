@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.sources import CurrentSource
-from gz_onboard.estimator.start import uncounted_sd
 from gz_onboard.estimator.timing import COARSE
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
@@ -47,14 +46,14 @@ CURRENT_ERRORS = {
 
 
 class ChargeUncertainty:
-    """The variance of SOC that counting charge adds. Remembers what the pauses left."""
+    """The variance of SOC that counting charge adds. Remembers what errs one way."""
 
     def __init__(self, battery: Battery, parameters: Parameters) -> None:
         p = parameters
         self._rated = battery.pack_capacity(BENCH_TEMPERATURE)  # A·h
         self._offset_sd = p.sd("pack_current_offset")
         self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
-        self._unseen = 0.0  # of SOC: sd that the pauses left
+        self._unseen = 0.0  # of SOC: sd of what errs one way
 
     def counted(self, dt: float, flowed: float, charge: float, error: CurrentError, apart: float | None) -> float:
         """Variance after `dt` [s] in which a share `flowed` of the capacity `charge` [A·s] was counted.
@@ -70,12 +69,13 @@ class ChargeUncertainty:
         """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
         return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > COARSE else 0.0
 
-    def of_pause(self, dt: float, soc_sd: float) -> float:
-        """Variance after a pause of `dt` [s], in which charge is not counted.
+    def one_way(self, more: float, soc_sd: float) -> float:
+        """Variance after `more` of SOC may have flowed that was not counted, as in a pause.
 
-        What was taken for it errs the same way each time: the rider goes on as before. soc_sd: what is known at most.
+        What was taken for it errs the same way each time: the rider goes on as before, the load stays. soc_sd: what is
+        known at most.
         """
-        before, more = min(self._unseen, soc_sd), uncounted_sd(dt)
+        before = min(self._unseen, soc_sd)
         self._unseen = before + more
         return (2 * before + more) * more
 

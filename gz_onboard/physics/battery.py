@@ -30,6 +30,7 @@ Overpotential = Callable[[float, float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, in the mean: of a cell's mean current [A], SOC,
 temperature [degC] and form factor squared, see `Battery.settled_current`."""
 HALF_FULL = 0.5  # SOC that is taken where it is not known
+MOST_SOC_SD = 0.3  # a SOC of which nothing is known lies between 0 and 1: that is 0.29
 QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
@@ -91,7 +92,7 @@ class Window:
     def shown(self, soc: float, sd: float) -> tuple[float, float]:
         """(state of charge as the vehicle shows it, its sd) for that of the cells."""
         width = self.high - self.low
-        return min(max((soc - self.low) / width, 0.0), 1.0), sqrt(sd * sd + self.sd**2) / width
+        return min(max((soc - self.low) / width, 0.0), 1.0), min(sqrt(sd * sd + self.sd**2) / width, MOST_SOC_SD)
 
     def of_cells(self, shown: float) -> float:
         """The cells' state of charge for what the vehicle shows."""

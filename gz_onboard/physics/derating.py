@@ -49,6 +49,12 @@ class Derating:
     regeneration_by_soc: DeratingCurve = FULL
     regeneration_gain: float = 1.0
 
+    @property
+    def top_spin(self) -> float | None:
+        """The motor speed [rad/s] from which on there is no current; None if that is not said."""
+        curve = self.current_by_motor_speed
+        return next((at for at, share in zip(curve.at, curve.share, strict=True) if not share and at > 0), None)
+
 
 AXES: dict[str, tuple[str, float, float]] = {
     "motor_speed": ("rad/s", 0.0, 5000.0),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from math import hypot, log, sqrt
 from typing import TYPE_CHECKING
 
-from gz_onboard.constants import MILD, WH_PER_KM
+from gz_onboard.constants import GRAVITY, MILD, WH_PER_KM
 from gz_onboard.physics.effect import QUANTITIES, failed
 from gz_onboard.physics.model import Bound, air_density
 
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 
 LATERAL = 1.1  # m/s², of the eight commissioning rides; each alone 0.26 (suburban) to 1.7 (oval)
 DRIFT = 0.055  # of the eight commissioning rides, which stay in town or on one road
+ANYWHERE = 0.2  # drift of what is fast enough for any road
+TOWN_SPEED = 11.0  # m/s, the fastest of a scooter's usual riding
+CRUISE, MOTORWAY = 0.8, 36.0  # what is ridden for long: of the top speed, and at most [m/s]
+SCOOTER = 13.7, 105.0  # top speed [m/s] and mass [kg]; of kick scooters to cars it goes with the mass, about so
+MOST_UNKNOWN = 0.75  # sd of the logarithm of the consumption: twice or half
 VIBRATION = 1.3  # m/s², RMS while moving, of the median of the eight commissioning rides; each alone 1.14 to 1.43
 
 
@@ -38,7 +44,7 @@ class PriorRiding:
         (0.08, 4.0, -1.1),
         (0.06, 9.0, -1.0),
         (0.20, 7.0, 0.0),
-        (0.30, 11.0, 0.0),
+        (0.30, TOWN_SPEED, 0.0),
     )
     unevenness: float = 1.1
     factor: float = 1.0
@@ -53,14 +59,36 @@ class PriorRiding:
         return sum(share * speed for share, speed, _ in self.points)
 
 
-def read_riding(vehicle: Table) -> PriorRiding:
-    """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC.
+def usual_riding(model: Model, top_speed: float | None) -> PriorRiding:
+    """The riding of a vehicle of which no more is known than `model` and its `top_speed` [m/s], if that.
+
+    A scooter rides in town as in the first part of the WMTC; what is slower, slower. What is faster may ride in town or
+    as fast as it can: the speed between at which the road load is the geometric mean of both, and not known by more
+    than what either is from that.
+    """
+    town, p = PriorRiding(), model.parameters
+    heavier = p["vehicle_mass"] / SCOOTER[1]
+    top = top_speed or SCOOTER[0] * max(heavier**0.5, heavier**1.5)
+    fast = round(min(CRUISE * top, MOTORWAY))
+    if fast <= TOWN_SPEED:
+        slower = tuple((share, speed * fast / TOWN_SPEED, a) for share, speed, a in town.points)
+        return replace(town, points=slower)
+    rolling, drag = p["rolling_resistance_constant"] * model.mass * GRAVITY, air_density(MILD) / 2 * p["drag_area"]
+    in_town, at_most = (rolling + drag * speed**2 for speed in (TOWN_SPEED, fast))
+    ratio = sqrt((sqrt(in_town * at_most) - rolling) / drag) / TOWN_SPEED
+    between = tuple((share, speed if a else speed * ratio, a) for share, speed, a in town.points)
+    unknown = min(hypot(town.factor_sd, log(at_most / in_town) / 2), MOST_UNKNOWN)
+    return replace(town, points=between, factor_sd=unknown, drift=ANYWHERE)
+
+
+def read_riding(vehicle: Table, model: Model, top_speed: float | None = None) -> PriorRiding:
+    """The table ``[forecast]`` of a vehicle file; what it does not say is as in `usual_riding`.
 
     ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²].
     """
     table = vehicle.table("forecast")
     table.only(["riding", "unevenness", "factor", "factor_sd", "drift", "lateral_acceleration", "vibration", "source"])
-    town = PriorRiding()
+    town = PriorRiding() if "riding" in table.values else usual_riding(model, top_speed)
     if "riding" not in table.values:
         points = town.points
     else:

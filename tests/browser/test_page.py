@@ -119,8 +119,6 @@ def test_the_days_distance_and_the_cells(page):
         )
         assert behind == pytest.approx(12.5 / 62.5 * 100, abs=0.1)
         assert goal == pytest.approx((12.5 + 18.3) / 62.5 * 100, abs=0.1)
-        sender.own = [odometer(1060.0), cells(22, 24, 27)]  # less room: fewer numbers
-        wait_for(lambda: page.inner_text("#band .ticks").split("\n") == ["−60", "0", "20", "40"], "fewer numbers")
         sender.own = [cells(22, 40, 52)]
         shows(page, alerts="A battery cell is too hot: 52 °C.", cells="cells 22 to 52 °C")
         late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
@@ -131,6 +129,12 @@ def test_the_days_distance_and_the_cells(page):
         shows(page, alerts="A battery cell is too cold: −8 °C.", cells="cells −8 to −7 °C")
         page.click("#language")
         shows(page, alerts="Eine Batteriezelle ist zu kalt: −8 °C.", cells="Zellen −8 bis −7 °C")
+
+
+def test_a_long_day_has_fewer_numbers_on_its_scale(page):
+    with dashboard("long", vehicle=vehicle_frames(1000.0)) as address, Sender("long", ON_ROUTE, [odometer(1060.0)]):
+        page.goto(address)
+        wait_for(lambda: page.inner_text("#band .ticks").split("\n") == ["−60", "0", "20", "40"], "fewer numbers")
 
 
 @pytest.mark.parametrize("state", [State.STARTING, State.INVALID])

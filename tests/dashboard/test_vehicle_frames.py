@@ -15,8 +15,9 @@ from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.command import range_view, view_of
 from gz_onboard.dashboard.picture import Picture, picture
-from gz_onboard.dashboard.vehicle_frames import DOUBTED, RIDING, VehicleFrames, cell_limits
+from gz_onboard.dashboard.vehicle_frames import RIDING, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import View
+from gz_onboard.estimator.signals import DOUBTED
 from gz_onboard.events import Activity, Estimate
 from gz_onboard.physics.derating import Derating, DeratingCurve
 from gz_onboard.vehicle import read_vehicle
@@ -38,9 +39,9 @@ def of(estimate: Estimate, *own: Own, before: tuple[str, ...] = (), after: float
 
 
 def test_cells_and_distance_are_those_of_the_frames():
-    got = json.loads(of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1012.4)).encoded())
+    got = json.loads(of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1001.4)).encoded())
     assert got["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
-    assert (got["odometer_km"], got["ridden_today_km"]) == (1012.4, 12.4)
+    assert (got["odometer_km"], got["ridden_today_km"]) == (1001.4, 1.4)
     assert got["alerts"] == []
 
 
@@ -177,9 +178,23 @@ def test_an_odometer_that_goes_back_begins_anew(tmp_path):
 def test_an_odometer_that_errs_for_some_seconds_makes_no_day(tmp_path, wrong):
     """As of an ECU that has just been started."""
     file = tmp_path / "day.json"
-    assert ridden(file, (1000.0, NOON), (1003.0, NOON), (wrong, NOON), (1004.0, NOON), lasts=2.0) == pytest.approx(4.0)
-    assert ridden(file, (1005.0, NOON), (wrong, NOON + DAY), (1006.0, NOON + DAY), lasts=2.0) == pytest.approx(1.0)
+    assert ridden(file, (1000.0, NOON), (1003.0, NOON), (wrong, NOON), (1004.0, NOON), lasts=60.0) == pytest.approx(4.0)
+    assert ridden(file, (1005.0, NOON), (wrong, NOON + DAY), (1006.0, NOON + DAY), lasts=60.0) == pytest.approx(1.0)
     assert json.loads(file.read_text())["odometer_km"] == 1005.0
+
+
+@pytest.mark.parametrize("wrong", [0.0, 900.0, 1050.0, 4e6])
+def test_an_odometer_that_leaps_is_not_shown(wrong):
+    """Nor sent to a broker, where a total that begins at 0 would count the whole life as ridden today."""
+    frames = VehicleFrames(REFERENCE)
+    shown = []
+    for i, km in enumerate([0.0] * 3 + [1000.0] * 3 + [wrong] * 60 + [1000.1]):
+        for one in PACK, odometer(km):
+            frames.take(own_frame(*one, NOON + i * 10**9), float(i))
+        shown.append(frames.odometer(float(i))[0])
+    assert shown[:3] == [None] * 3
+    assert {km for km in shown[3:] if km is not None} == {1000.0, 1000.1}
+    assert shown[-2:] == [None, 1000.1]
 
 
 def test_an_odometer_that_begins_with_nothing_makes_no_day(tmp_path):

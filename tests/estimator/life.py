@@ -16,9 +16,11 @@ import numpy as np
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event, Group
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.support import ROOT
 
 VEHICLE = read_vehicle("reference", 75.0)
+LFP = read_vehicle(str(ROOT / "tests/vehicles/lfp.toml"), 75.0)  # whose voltage tells next to nothing from 0.2 to 0.95
 BATTERY = VEHICLE.pack
 PERIOD = 0.2  # s, of the messages that come often
 GROUPS = [
@@ -37,6 +39,7 @@ class Scooter:
     """The truth, and the time."""
 
     soc: float = 0.8
+    vehicle: Vehicle = VEHICLE
     temperature: float = 20.0
     offset: float = 0.05  # A
     capacity: float = 32.5  # A·h
@@ -71,8 +74,9 @@ class Scooter:
                 yield from self._told(current, voltage, charge, step // every)
 
     def _draw(self, power: float, charge: float) -> tuple[float, float]:
-        resistance = 0.066 * self.resistance
-        source = 14 * (float(np.interp(self.soc, BATTERY.ocv_soc, BATTERY.ocv_value)) - self.fast - self.slow)
+        resistance, pack = 0.066 * self.resistance, self.vehicle.pack
+        rest = float(np.interp(self.soc, pack.ocv_soc, pack.ocv_value))
+        source = pack.cells_series * (rest - self.fast - self.slow)
         current = (source - sqrt(max(source**2 - 4 * resistance * power, 0))) / (2 * resistance) - charge
         voltage = source - resistance * current
         cell = current / 12
@@ -101,8 +105,13 @@ class Scooter:
             pass
 
 
-def estimator(groups: list[Group] | None = None) -> Any:  # what is not known is None, and tests know better
-    return Estimator(groups or GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+def flat_pack(**made: Any) -> Scooter:
+    """A scooter of `LFP`."""
+    return Scooter(vehicle=LFP, capacity=39.0, resistance=0.4, **made)
+
+
+def estimator(groups: list[Group] | None = None, vehicle: Vehicle = VEHICLE) -> Any:  # tests know what is not None
+    return Estimator(groups or GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
 
 
 def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[float, Any]]:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_calm
 from gz_onboard.estimator.usual import Habit, Usual, restored_usual
 from gz_onboard.physics.riding import PriorRiding
@@ -168,6 +169,7 @@ def test_nothing_known_is_followed_at_once():
 )
 def test_what_is_implausible_is_refused(saved):
     with pytest.raises((TypeError, ValueError)):
+        within("riding", saved)
         restored_calm(saved)
 
 

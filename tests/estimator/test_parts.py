@@ -138,7 +138,7 @@ def test_a_fix_is_below_only_while_it_is_reported():
 def wait(steady: SteadyVoltage, voltage, seconds: float):
     """(time [s] at which the wait is over, what it gives)."""
     for step in range(round(seconds * 10) + 1):
-        if found := steady.step(step / 10, voltage(step / 10), 0.0, 25.0, 0.0, 1.0, False):
+        if found := steady.step(step / 10, voltage(step / 10), 0.0, 25.0, 0.0, 1.0, STEADY_TIME):
             return step / 10, found
     return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from math import exp
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from gz_onboard.estimator.redundancy.checks import SETTLED, RateLimit
 from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, follow, worst
+from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, flat_pack, follow, worst
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
 
@@ -171,6 +172,12 @@ def test_a_gps_without_a_fix_tells_no_speed():
         {"current": 1e200},
         {"own_soc": 1e200},
         {"gyro_bias": [0.0, 0.5]},
+        {"soc": -0.04},
+        {"soc": 1.04},
+        {"covariance": [-0.01, 0.0, 1e-6]},
+        {"covariance": [0.3, 0.0, 1e-6]},
+        {"covariance": [float("inf"), 0.0, 1e-6]},
+        {"v1": float("nan")},
     ],
     ids=str,
 )
@@ -179,6 +186,45 @@ def test_a_saved_number_that_cannot_be_is_refused(damage):
     follow(e, scooter.live(60, 10.0), scooter)
     with pytest.raises(ValueError, match="implausible"):
         estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
+
+
+def numbers(saved, path=()):
+    """The paths of the numbers in a snapshot."""
+    for key, value in saved.items() if isinstance(saved, dict) else enumerate(saved):
+        if isinstance(value, dict | list):
+            yield from numbers(value, (*path, key))
+        elif isinstance(value, int | float):
+            yield (*path, key), value
+
+
+@pytest.mark.parametrize("make", [Scooter, flat_pack])
+@pytest.mark.parametrize("wrong", [lambda x: -10 * x, lambda x: 10 * x, lambda _: 4.0, lambda _: 1e6])
+def test_whatever_was_saved_what_is_published_can_be(make, wrong):
+    """A number that is wrong is refused, or what is made of it has an interval that can be."""
+    scooter = make(soc=0.6)
+    e = estimator(vehicle=scooter.vehicle)
+    follow(e, scooter.live(30), scooter)
+    follow(e, scooter.live(300, 10.0), scooter)
+    saved = json.loads(json.dumps(e.snapshot("key")))
+    for part in "segments", "pattern":
+        del saved["riding"][part][2:]
+    events = [*scooter.live(4), *scooter.live(2, 8.0)]
+    taken = 0
+    for path, value in numbers(saved):
+        changed, part = (whole := json.loads(json.dumps(saved))), path[-1]
+        for key in path[:-1]:
+            changed = changed[key]
+        changed[part] = wrong(value)
+        fresh = estimator(vehicle=scooter.vehicle)
+        try:
+            fresh.restore(whole, "key", 3600.0)
+        except ValueError:
+            continue
+        taken += 1
+        for _, row in follow(fresh, events, scooter):
+            assert row.soc_sd is None or row.soc_sd <= 0.3, path
+            assert not row.range or row.range_p10 < row.range <= row.range_p90 < 1e6, (path, row)
+    assert taken > 30
 
 
 @pytest.mark.parametrize(("seconds", "charge"), [(3600, 15.0), (7200, 8.0), (600, 15.0), (3600, 0.0)])

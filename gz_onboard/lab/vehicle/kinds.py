@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.physics.riding import ANYWHERE, PriorRiding
 
 Guess = tuple[float, float]
 """A value and its standard deviation."""
@@ -25,7 +25,7 @@ class Kind:
     drift: float  # between rides, relative: that of the reference scooter in its town, or of a car
 
 
-TOWN, ANYWHERE = PriorRiding().drift, 0.2
+TOWN = PriorRiding().drift
 SMALL, LARGE = "range.dbc", "range_large.dbc"
 KINDS = {
     "kick-scooter": Kind("stood on", (75.0, 12.0), (0.55, 0.08), (0.015, 0.004), SMALL, 800.0, 25.0, 1.5, TOWN),
