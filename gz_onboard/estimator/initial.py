@@ -18,6 +18,7 @@ STEADY_TIME = 0.5  # s over which the first voltage must hold still; an inverter
 STEADY_SHARE = 0.02  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load
 DROP_FACTOR = 3.0  # of the drop by a load that the tables give: no cell has more, cold and aged ones included
 STEADY_AFTER = 10.0  # s over which it must hold still after it has once been seen to move
+DOUBT_WAIT = 5.0  # s to wait for what comes, but cannot be right yet
 STEADY_WAIT = 60.0  # s after which it is begun with whatever there is, knowing nothing
 STEADY_SD = 4.0  # of the movement: how much may be still to come
 PULLING_RATE = 0.5  # 1/h: current over capacity from which a vehicle that does not move yet has been under load already

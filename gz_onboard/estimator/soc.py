@@ -11,9 +11,9 @@ from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, Noise, SocFilter
 from gz_onboard.estimator.gate import InnovationGate
 from gz_onboard.estimator.initial import (
+    DOUBT_WAIT,
     DROP_FACTOR,
     START_WAIT,
-    STEADY_AFTER,
     STEADY_TIME,
     Situation,
     SteadyVoltage,
@@ -358,7 +358,7 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
-        least = STEADY_AFTER if self.saved and self._signals.doubted else START_WAIT if missing else STEADY_TIME
+        least = DOUBT_WAIT if self.saved and self._signals.doubted else START_WAIT if missing else STEADY_TIME
         battery = self._battery
         found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, least)
         if found is None:
