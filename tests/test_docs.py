@@ -68,7 +68,7 @@ def test_links_lead_somewhere(page):
 
 def test_what_a_page_includes_is_also_linked_for_who_reads_it_where_nothing_is_included():
     included = [(page, file) for page in DOCS for file in re.findall(r"^```\{include\} (\S+)", TEXT[page], re.M)]
-    assert len(included) >= 2
+    assert included
     for page, file in included:
         assert re.search(rf"^% .*\]\({re.escape(file)}[#)]", TEXT[page], re.M), name_of(page)
 
