@@ -268,8 +268,10 @@ HELP = {parser.prog: parser.format_help for parser in parsers(command_line(COMMA
 
 
 @pytest.mark.parametrize("command", HELP)
-def test_every_page_of_help(command: str):
+def test_every_page_of_help_is_one_screen(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "100")
     page = HELP[command]()
+    assert len(page.splitlines()) <= 40
     assert page.startswith(f"usage: {command} ")
     assert "%%" not in page
     assert "%(" not in page
@@ -281,7 +283,7 @@ def test_a_wrong_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFix
         main([*command.split(), "--nonsense", RIDE, RIDE])
     assert ended.value.code == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"usage: gz-onboard {command} [-h] ")
+    assert said.startswith(f"usage: gz-onboard {command} [OPTION ...]")
     assert f"\ngz-onboard {command}: error: unrecognized arguments: --nonsense" in said
 
 
