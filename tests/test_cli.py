@@ -119,7 +119,10 @@ def test_a_kernel_without_can(capsys: pytest.CaptureFixture[str], monkeypatch: p
 
     monkeypatch.setattr("can.Bus", none)
     for arguments in ["run"], ["replay", RIDE]:
-        assert "this kernel has no CAN sockets" in refused(capsys, *arguments, "--channel", "a")
+        said = refused(capsys, *arguments, "--channel", "a")
+        assert "this kernel has no CAN sockets" in said
+        assert "sudo modprobe can_raw" in said
+        assert "--interface udp_multicast --channel 239.74.163.2" in said
 
 
 VEHICLE = (ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
