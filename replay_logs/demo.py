@@ -65,7 +65,7 @@ class Row(NamedTuple):
     usual: float
 
     def __str__(self) -> str:
-        interval = f"{self.range:.1f} km ({self.p10:.1f} to {self.p90:.1f})"
+        interval = f"{self.range:4.1f} km ({self.p10:.1f} to {self.p90:.1f})"
         numbers = f"{self.battery:9.0f} %{self.ridden:7.1f} km    {interval:<24}{self.left:8.1f} km"
         return numbers + (f"{self.usual:12.1f} km" if self.ridden > LEAST else "")
 
@@ -161,7 +161,7 @@ def main() -> int:
                 raise SystemExit(f"demo: discover failed: {(folder / 'discover.txt').read_text()}")
             print(f"""\
 {sentence(json.loads(found.read_text()))}
-    Page: {page.resolve().as_uri()}
+    Report: {page.resolve().as_uri()}
 
     On a ride of your own: .venv/bin/gz-onboard estimate RIDE""")
         finally:
@@ -199,7 +199,7 @@ gz_onboard tells the rider of an electric scooter how far it will still go, from
 recorded rides it also finds what the model of the scooter gets wrong.
 
 1  Range. {line.last - line.first:.1f} km from full until the scooter gave up, recorded: what was really left is known.
-    The usual gauge assumes that each percent of the battery goes on taking it as far as so far.
+    The usual gauge is the kilometres ridden per percent of battery used, times the percent left.
 
 {HEAD}""",
         flush=True,
@@ -236,7 +236,7 @@ def live(args: argparse.Namespace) -> int:
         )
     print(
         f"""\
-    The last {args.seconds:g} s live, the log replayed to the daemon on {where}:
+    The last {args.seconds:g} s live: the log is replayed to the daemon on {where}.
     Dashboard: {reach}""",
         flush=True,
     )

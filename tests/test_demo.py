@@ -53,7 +53,7 @@ def test_it_shows_range_and_discovery_on_one_screen(tmp_path):
     assert (folder / "range.png").read_bytes().startswith(b"\x89PNG")
     (found,) = re.findall(r"Found: .*\(cornering_drag\), (\S+) % of the energy", text)
     assert 2 < float(found) < 5
-    (uri,) = re.findall(r"Page: (file://\S+)", text)
+    (uri,) = re.findall(r"Report: (file://\S+)", text)
     assert "<html" in Path(urlparse(uri).path).read_text(encoding="utf-8")
 
 
