@@ -1,16 +1,13 @@
 # What each target does: make help. All of them set up what they need themselves.
 
-RIDE ?= $(firstword $(wildcard replay_logs/*.blf))
-SPEED ?= 1
-SECONDS ?= 60
+BUS ?=
 CASES ?= 120
 FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
-VALIDATED := $(addprefix replay_logs/,calibration/ride_000.blf turning/city_11C.blf city_14C.blf calibration/ride_003.blf \
+VALIDATED := $(addprefix replay_logs/,calibration/ride_000.blf turning/city_11C.mcap city_14C.blf calibration/ride_003.blf \
     calibration/ride_004.blf turning/oval_2C.blf calibration/ride_006.blf calibration/ride_007.blf city_34C.blf \
     validation/dyno_00.blf calibration/dyno_02.blf)
 MAPPED := $(addprefix replay_logs/,calibration/motor_dyno.csv.gz calibration/ride_000.blf city_14C.blf)
-DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
 .PHONY: help setup run test lint format docs man deb deb-clean-root bench trial range-benchmark validation hardening clean
 .DEFAULT_GOAL := help
@@ -23,13 +20,8 @@ setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
 .venv/.ready: pyproject.toml .ci/requirements.txt .ci/setup
 	@.ci/setup venv
 
-run: setup  ## a recorded ride through the daemon on a CAN bus, with the live range (RIDE=file SPEED=factor SECONDS=n)
-	@if .ci/setup vcan; then \
-	    $(PYTHON_IN_VENV) tests/vcan-guest -- $(PYTHON_IN_VENV) $(DEMO); \
-	else \
-	    echo; echo "!!! No real vcan on this machine (reason above): an in-process virtual bus instead."; echo; \
-	    $(PYTHON_IN_VENV) $(DEMO) --interface virtual; \
-	fi
+run: setup  ## a recorded full discharge with its range, the end live on a CAN bus; then a hidden loss found in three rides
+	@bus=$(BUS); [ "$$bus" ] || { .ci/setup vcan && bus=vcan || bus=virtual; }; $(PYTHON_IN_VENV) replay_logs/demo.py --bus $$bus
 
 test: setup  ## every test, on the host, on a real vcan and under systemd
 	@.ci/test

@@ -29,7 +29,7 @@ from gz_onboard.simulation.recorded import read_recorded
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 RIDES = Path(__file__).parents[1] / "replay_logs"
-TOWN = (RIDES / "city_14C.blf", RIDES / "city_34C.blf", RIDES / "turning" / "city_11C.blf")
+TOWN = (RIDES / "city_14C.blf", RIDES / "city_34C.blf", RIDES / "turning" / "city_11C.mcap")
 OVAL = RIDES / "turning" / "oval_2C.blf"
 
 

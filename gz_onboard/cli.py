@@ -54,8 +54,26 @@ COMMANDS = {
 }
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """argparse's help, without the options in its first line: they are listed below."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30)
+
+    def _format_usage(self, usage: str | None, actions: Any, groups: Any, prefix: str | None) -> str:
+        # Of a command in a command argparse asks without options: that is how it is called.
+        arguments = [action for action in actions if not action.option_strings]
+        options = (
+            [argparse.Action(["[OPTION ...]"], "", nargs=0, required=True)] if len(arguments) < len(actions) else []
+        )
+        return super()._format_usage(usage, options + arguments, [], prefix)
+
+
 class _Parser(argparse.ArgumentParser):
     """argparse that names the nearest right option or command."""
+
+    def __init__(self, *args: Any, **others: Any) -> None:
+        super().__init__(*args, **{"formatter_class": _Help, **others})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """What a command does not know is its own error, with its own usage: argparse leaves it to the whole line's."""
@@ -112,7 +130,6 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
         prog="gz-onboard",
         description="Range of an electric scooter, estimated from its CAN bus.",
         epilog=f"exit status:\n{statuses}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)

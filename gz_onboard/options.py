@@ -89,7 +89,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     ),
     "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),
     "--json": (
-        "write the result as JSON to FILE, or instead of text to standard output",
+        "write JSON to FILE, or to standard output instead of text",
         {"nargs": "?", "const": "-", "type": _json_file, "metavar": "FILE|-"},
     ),
     "--format": (

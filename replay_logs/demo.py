@@ -1,114 +1,290 @@
-"""A recorded ride through the daemon, on a bus: what `make run` shows.
+"""A full discharge with the range beside the truth, then what three rides hide: what `make run` shows.
 
-On a vcan the daemon, the replay and the dashboard are three processes that share nothing but the bus. On
-python-can's `virtual` interface, which ends where the process ends, they are three threads of this one. A second
-dashboard serves the page for a browser; where Chromium is, it is photographed. In a guest, whose network no browser
-outside reaches, that is done inside.
+All but the last seconds go through the daemon's pipeline as fast as it can. From what that knows the daemon continues
+on a CAN bus, onto which the last seconds are replayed in its own time. `discover` runs beside it. Where the kernel has
+no CAN, the part on the bus runs in a guest, which calls this file again with ``--live``.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import io
+import csv
+import json
 import os
-import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from math import inf
 from pathlib import Path
+from typing import Any, NamedTuple, TextIO, cast
 
-import can
+from cantools.database.can import Message
 
+from gz_onboard import cli, state
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.publisher import Publisher
-from gz_onboard.events import EFF_FLAG, TRANSMITTED
+from gz_onboard.daemon.keeper import state_file
+from gz_onboard.dashboard.view import View
+from gz_onboard.events import Frame
+from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
+from gz_onboard.log_rows import ESTIMATE_TOPIC
+from gz_onboard.offline.style import BLUE, INK, ORANGE, legend, new_figure, ordinate, rule, save
 from gz_onboard.vehicle import read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
-BIN = Path(sys.executable).parent
+LOGS = ROOT / "replay_logs"
+RIDES = LOGS / "city_14C.blf", LOGS / "turning" / "city_11C.mcap", LOGS / "turning" / "oval_2C.blf"
+VEHICLE = read_vehicle("reference")
+ODOMETER, PACK = (VEHICLE.mapping.database.get_message_by_name(name) for name in ("VCU_Odometer", "BMS_Pack"))
+CHANNEL = "vcan0"
 GUEST = Path("/run/vcan-guest")
-READY_WITHIN = 30.0  # s
-STOPPED_WITHIN = 15.0  # s
 PORT = 8000  # of the page, if it is free
+READY_WITHIN = 30.0  # s
+KEPT = 80, 50, 20, 10  # %: of which charge a copy of the line stays
+REDRAW = 0.1  # s
+LEAST = 3.0  # km ridden, before which the usual gauge shows nothing
+MEANING = {"cornering_drag": "drag of the tyres in bends (cornering_drag)"}
+HEAD = "    battery    ridden    range, 80 % interval     really left    usual gauge"
+
+
+class Row(NamedTuple):
+    """One moment of the ride: the battery in %, all else in km. usual: what the usual gauge shows."""
+
+    battery: float
+    ridden: float
+    range: float
+    p10: float
+    p90: float
+    left: float
+    usual: float
+
+    def __str__(self) -> str:
+        interval = f"{self.range:4.1f} km ({self.p10:.1f} to {self.p90:.1f})"
+        numbers = f"{self.battery:9.0f} %{self.ridden:7.1f} km    {interval:<24}{self.left:8.1f} km"
+        return numbers + (f"{self.usual:12.1f} km" if self.ridden > LEAST else "")
+
+
+class Line:
+    """A line that is drawn anew, of which copies stay; where there is no terminal, only these are written."""
+
+    def __init__(self, ride: Path, out: TextIO, terminal: bool, kept: Sequence[int] = KEPT) -> None:
+        self.rows: list[Row] = []
+        self.now: dict[str, float] = {}  # the signals of `ODOMETER` and `PACK`
+        self._out, self._terminal, self._kept, self._drawn = out, terminal, list(kept), 0.0
+        frames = [frame for batch in read_frames(ride) for frame in batch]
+        first, last = (
+            [next(f for f in way if f[1] == m.frame_id) for m in (ODOMETER, PACK)] for way in (frames, frames[::-1])
+        )
+        self.begin_ns, self.end_ns = frames[0][0], frames[-1][0]
+        self.first, self.last = (decoded(ODOMETER, of[0])["VCU_Odometer"] for of in (first, last))
+        self._full = decoded(PACK, first[1])["BMS_StateOfCharge"]
+
+    def take(self, frame: Frame) -> None:
+        """Take in a frame of the vehicle's."""
+        for message in (ODOMETER, PACK):
+            if frame[1] == message.frame_id:
+                self.now |= decoded(message, frame)
+
+    def show(self, *km: float | None) -> None:
+        """Show range, P10 and P90."""
+        known = [value for value in km if value is not None]
+        if len(known) < 3 or not self.now.keys() >= {"VCU_Odometer", "BMS_StateOfCharge"}:
+            return
+        battery, odometer = self.now["BMS_StateOfCharge"], self.now["VCU_Odometer"]
+        ridden = odometer - self.first
+        usual = battery * ridden / max(self._full - battery, 0.5)
+        self.rows.append(Row(battery, ridden, *known, self.last - odometer, usual))
+        if self._kept and battery <= self._kept[0]:
+            self._kept = [percent for percent in self._kept if percent < battery]
+            self.keep()
+        elif self._terminal and time.monotonic() - self._drawn > REDRAW:
+            self._drawn = time.monotonic()
+            print(f"\r\x1b[K{self.rows[-1]}", end="", file=self._out, flush=True)
+
+    def keep(self) -> None:
+        """Let the line stay as it is."""
+        print("\r\x1b[K" * self._terminal + str(self.rows[-1]), file=self._out, flush=True)
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Of the log that `ride_through` takes this for: not needed."""
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Likewise."""
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, Any], seen_ns: int | None = None) -> None:
+        """What is estimated, and what the vehicle says, once a second."""
+        if topic == ESTIMATE_TOPIC:
+            self.show(*(None if values[n] is None else values[n] * 1e-3 for n in ("range", "range_p10", "range_p90")))
+        elif topic.removeprefix("/can/") in (ODOMETER.name, PACK.name):
+            self.now |= values
 
 
 def main() -> int:
-    """Play the ride, then show what it left behind."""
+    """Show it all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ride", type=Path)
-    parser.add_argument("--interface", default="socketcan", choices=["socketcan", "virtual"])
-    parser.add_argument("--channel", default="vcan0")
-    parser.add_argument("--vehicle", default="reference")
-    parser.add_argument("--speed", type=float, default=1.0, help="of the replay; 1 is the ride's own timing")
-    parser.add_argument("--seconds", type=float, default=60.0, help="end the replay after this long")
-    parser.add_argument("--output", type=Path, help="the folder for what it leaves behind (default: one in runs/)")
+    parser.add_argument(
+        "ride", nargs="?", type=Path, default=LOGS / "full_discharge.mcap", help="a ride until the battery was empty"
+    )
+    parser.add_argument("--bus", default="vcan", choices=["vcan", "virtual"])
+    parser.add_argument("--seconds", type=float, default=40.0, help="of the end of the ride, live on the bus")
+    parser.add_argument("--output", type=Path, help="folder to write to (default: one in runs/)")
+    parser.add_argument("--live", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--terminal", action="store_true", default=sys.stdout.isatty(), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if not args.ride.is_file():
-        parser.error(f"no such ride: {args.ride}")
-
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # in the order of what the other processes write
-    directory = args.output or ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
-    directory.mkdir(parents=True)
-    bus = ["--interface", args.interface, "--channel", args.channel]
-    own_directories = ["--log-dir", str(directory), "--state-dir", str(directory)]
-    daemon = ["run", "--vehicle", args.vehicle, *bus, *own_directories]
-    replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
-    dbc = read_vehicle(args.vehicle).range_dbc
-    dashboard = ["dashboard", *bus, "--vehicle", args.vehicle]
-    listen = f"127.0.0.1:{free_port()}"
-    page = [*dashboard, "--web", "--listen", listen]
-
-    where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
-    print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")
-    print(f"=== The dashboard's page{' (inside the guest)' if GUEST.is_dir() else ''}: http://{listen}/")
-    frames, picture = directory / "range.log", directory / "page.png"
-    play = play_in_threads if args.interface == "virtual" else play_in_processes
+    if args.live:
+        return live(args)
+    folder = args.output = args.output or ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
+    folder.mkdir(parents=True)
+    found, page, picture = folder / "discover.json", folder / "discover.html", folder / "range.png"
+    words = ["discover", *map(str, RIDES), "--quiet", "--json", str(found), "--report", str(page)]
     with (
-        recording(args.interface, args.channel, frames, dbc),
-        photographing(f"http://{listen}/", picture),
-        listening_for_ready() as wait_until_ready,
+        (folder / "discover.txt").open("w") as told,
+        subprocess.Popen(gz(*words), stdout=told, stderr=told) as discover,
     ):
-        status = play(daemon, replay, dashboard, page, wait_until_ready, args.seconds)
-    if status:
-        print(f"demo: ended with status {status}", file=sys.stderr)
-        return status
+        try:
+            rows = show_range(args)
+            draw(rows, picture)
+            print(f"""\
+    When the scooter stopped, the usual gauge promised another {rows[-1].usual:.1f} km.
+    Error on average over the ride: range {off(rows, "range"):.1f} km, usual gauge {off(rows, "usual"):.1f} km.
+    Picture: {shown(picture)}
 
-    (log,) = directory.glob("*.mcap")
-    show_decoded(frames, log, dbc)
-    overview = directory / "overview.png"
-    subprocess.run([BIN / "gz-onboard", "plot", log, overview], check=True)
-    print("\n=== What the ride left behind")
-    for what, path in ("log", log), ("overview", overview), ("range frames", frames), ("page", picture):
-        if path.exists():
-            print(f"{what:13} {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}")
-    if not picture.exists():
-        print(f"{'page':13} was at http://{listen}/; no picture of it, which takes Chromium and some seconds")
+2  Discovery. Three recorded rides took more energy than the model says. discover is not told why.
+""")
+            if discover.wait():
+                raise SystemExit(f"demo: discover failed: {(folder / 'discover.txt').read_text()}")
+            print(f"""\
+{sentence(json.loads(found.read_text()))}
+    Report: {page.resolve().as_uri()}
+
+    On a ride of your own: .venv/bin/gz-onboard estimate RIDE""")
+        finally:
+            discover.terminate()
     return 0
 
 
-@contextlib.contextmanager
-def recording(interface: str, channel: str, file: Path, dbc: Path) -> Iterator[None]:
-    """Record the range frames, and nothing else, as candump does."""
-    filters = [
-        can.typechecking.CanFilter(can_id=i & ~EFF_FLAG, can_mask=0x1FFFFFFF, extended=bool(i & EFF_FLAG))
-        for i in Publisher(dbc).identifiers
-    ]
-    with can.Bus(interface=interface, channel=channel, can_filters=filters) as bus:
-        writer = can.CanutilsLogWriter(file, channel=channel)
-        notifier = can.Notifier(bus, [writer])
-        try:
-            yield
-        finally:
-            notifier.stop()
-            writer.stop()
+def decoded(message: Message, frame: Frame) -> dict[str, float]:
+    """The signals of a frame."""
+    return cast(dict[str, float], message.decode(frame[2], decode_choices=False))
+
+
+def gz(*words: str) -> list[str]:
+    """The command line, as its own process."""
+    return [sys.executable, "-m", "gz_onboard", *words]
+
+
+def shown(path: Path) -> Path:
+    """The path as short as it can be from the repository."""
+    return path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+
+
+def off(rows: Sequence[Row], name: str) -> float:
+    """How wrong a range was on average over the way [km]."""
+    ridden = [(a.ridden - b.ridden, abs(getattr(a, name) - a.left)) for b, a in pairwise(rows) if b.ridden > LEAST]
+    return sum(way * wrong for way, wrong in ridden) / sum(way for way, _ in ridden)
+
+
+def show_range(args: argparse.Namespace) -> list[Row]:
+    """Fast until the last seconds of the ride, then live; all that was shown."""
+    line = Line(args.ride, sys.stdout, args.terminal)
+    print(
+        f"""\
+gz_onboard tells the rider of an electric scooter how far it will still go, from its CAN bus. From
+recorded rides it also finds what the model of the scooter gets wrong.
+
+1  Range. {line.last - line.first:.1f} km from full until the scooter gave up, recorded: what was really left is known.
+    The usual gauge is the kilometres ridden per percent of battery used, times the percent left.
+
+{HEAD}""",
+        flush=True,
+    )
+    live_ns = line.end_ns - round(args.seconds * 1e9)
+    ride = OpenRide(args.ride, VEHICLE, line.begin_ns, read_frames(args.ride, None, live_ns), [])
+    estimator = ride_through(ride, How(signals=True), line).pipeline.estimator
+    snapshot = estimator.snapshot(VEHICLE.key)
+    assert snapshot, "nothing is known before the live part"
+    state.write(state_file(args.output, VEHICLE.name), state.encode(snapshot, time.time()))
+    where = [] if args.bus == "virtual" else [sys.executable, str(ROOT / "tests" / "vcan-guest"), "--"]
+    words = [args.ride, "--live", "--bus", args.bus, "--seconds", args.seconds, "--output", args.output]
+    line.keep()
+    subprocess.run([*where, sys.executable, __file__, *map(str, words), *["--terminal"] * args.terminal], check=True)
+    with (args.output / "live.csv").open() as file:
+        return [*line.rows, *(Row(*map(float, row)) for row in csv.reader(file))]
+
+
+def live(args: argparse.Namespace) -> int:
+    """The end of the ride on the bus: daemon, replay and dashboard, each as its command."""
+    interface = "virtual" if args.bus == "virtual" else "socketcan"
+    bus = ["--interface", interface, "--channel", CHANNEL]
+    address = f"127.0.0.1:{free_port()}"
+    where = (
+        "python-can's virtual bus (no CAN socket)"
+        if args.bus == "virtual"
+        else f"{CHANNEL} of Linux {os.uname().release}"
+    )
+    reach = f"http://{address}/"
+    if GUEST.is_dir():
+        where += " in a guest"
+        reach = (
+            f"inside the guest, out of a browser's reach; `make run BUS=virtual` serves it at http://127.0.0.1:{PORT}/"
+        )
+    print(
+        f"""\
+    The last {args.seconds:g} s live: the log is replayed to the daemon on {where}.
+    Dashboard: {reach}""",
+        flush=True,
+    )
+    # As if it had been saved here and now: neither the drive to the guest nor the age of the recording is a pause.
+    file = state_file(args.output, VEHICLE.name)
+    snapshot, _ = state.load(file, inf) or ({}, None)
+    state.write(file, state.encode(snapshot, time.time(), time.clock_gettime(time.CLOCK_BOOTTIME)))
+    line = Line(args.ride, sys.stdout, args.terminal, kept=())
+    begin = (line.end_ns - line.begin_ns) * 1e-9 - args.seconds
+    replay = ["replay", str(args.ride), *bus, "--from", str(begin), "--quiet"]
+    dashboard = ["dashboard", *bus, "--web", "--listen", address]
+    threading.Thread(target=watch, args=(line, interface, dashboard, replay), daemon=True).start()
+    with (
+        (args.output / "daemon.txt").open("w") as told,
+        contextlib.redirect_stdout(told),
+        contextlib.redirect_stderr(told),
+    ):
+        status = cli.main(["run", *bus, "--log-dir", str(args.output), "--state-dir", str(args.output)])
+    line.keep()
+    with (args.output / "live.csv").open("w") as out:
+        csv.writer(out).writerows(line.rows)
+    return status
+
+
+def watch(line: Line, interface: str, dashboard: list[str], replay: list[str]) -> None:
+    """Wait for the daemon, replay the ride, show what the daemon sends, and end it with the ride."""
+    view = View(VEHICLE.publisher())
+    identifiers = [*(view.identifiers or ()), ODOMETER.frame_id, PACK.frame_id]
+    channel = CanChannel(interface, CHANNEL, identifiers=identifiers)
+    channel.open()
+    threads = [threading.Thread(target=cli.main, args=(words,), daemon=True) for words in (dashboard, replay)]
+    started = shown_at = time.monotonic()
+    while threads[-1].is_alive() or not threads[-1].ident:
+        time.sleep(0.05)
+        now = time.monotonic()
+        for frame in channel.drain():
+            view.take(frame, now)
+            line.take(frame)
+        if not threads[-1].ident and view.messages["RANGE_Status"].received:
+            for thread in threads:
+                thread.start()
+        elif not threads[-1].ident and now - started > READY_WITHIN:
+            break
+        if now - shown_at > 1.0:
+            shown_at = now
+            line.show(*(view.value(f"RANGE_Remaining{what}", now) for what in ("", "P10", "P90")))
+    channel.close()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def free_port() -> int:
@@ -121,100 +297,38 @@ def free_port() -> int:
     raise OSError("no free port on 127.0.0.1")
 
 
-@contextlib.contextmanager
-def photographing(address: str, picture: Path) -> Iterator[None]:
-    """Meanwhile have a browser make a picture of the page as soon as it shows a range, if there is one."""
-    if not shutil.which("chromium"):
-        yield
-        return
-    camera = [sys.executable, "-m", "tests.browser.photograph", address, str(picture.resolve())]
-    with subprocess.Popen(camera, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            yield
-        finally:
-            process.terminate()
+def sentence(report: Mapping[str, Any]) -> str:
+    """What was found, in a sentence, and what it is good for in another."""
+    if not report["causes"]:
+        return f"    Found: {report['verdict']}."
+    cause, gain = report["causes"][0], report["gain"]["range"]
+    name, share = MEANING.get(cause["name"], cause["name"].replace("_", " ")), cause["energy_share"]
+    low, high = (100 * share * end / cause["value"] for end in cause["ci95"])
+    return f"""\
+    Found: {name}, {100 * share:.1f} % of the energy (95 %: {low:.1f} to {high:.1f}).
+    Error of the model's range on rides it was not fitted to: {100 * gain["before"]:.1f} %; with its parameters
+    refitted {100 * gain["control"]:.1f} %; with what was found {100 * gain["after"]:.1f} %."""
 
 
-@contextlib.contextmanager
-def listening_for_ready() -> Iterator[Callable[[], bool]]:
-    """What systemd does for a service: hear the daemon say that it is ready. Yields the function that waits for it."""
-    with tempfile.TemporaryDirectory() as directory, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
-        os.environ["NOTIFY_SOCKET"] = f"{directory}/notify"
-        server.bind(os.environ["NOTIFY_SOCKET"])
-        server.settimeout(READY_WITHIN)
-
-        def wait() -> bool:
-            with contextlib.suppress(TimeoutError):
-                return server.recv(4096).startswith(b"READY=1")
-            return False
-
-        yield wait
-        del os.environ["NOTIFY_SOCKET"]
-
-
-def play_in_processes(
-    daemon: list[str],
-    replay: list[str],
-    dashboard: list[str],
-    page: list[str],
-    wait_until_ready: Callable[[], bool],
-    seconds: float,
-) -> int:
-    """Run the commands as processes; the daemon's exit status."""
-    command = str(BIN / "gz-onboard")
-    with contextlib.ExitStack() as stack:
-        daemon_process = stack.enter_context(subprocess.Popen([command, *daemon]))
-        stack.callback(daemon_process.terminate)
-        if not wait_until_ready():
-            return daemon_process.poll() or 1
-        stack.callback(stack.enter_context(subprocess.Popen([command, *page])).terminate)
-        dashboard_process = stack.enter_context(subprocess.Popen([command, *dashboard]))
-        stack.callback(dashboard_process.terminate)
-        with contextlib.suppress(subprocess.TimeoutExpired):  # a ride may be longer than the demonstration
-            subprocess.run([command, *replay], timeout=seconds, check=True)
-        if dashboard_process.poll() is not None:
-            print("demo: the dashboard ended before the ride did", file=sys.stderr)
-            return 1
-        dashboard_process.terminate()
-        dashboard_process.wait(STOPPED_WITHIN)
-        daemon_process.terminate()
-        return daemon_process.wait(STOPPED_WITHIN)
-
-
-def play_in_threads(
-    daemon: list[str],
-    replay: list[str],
-    dashboard: list[str],
-    page: list[str],
-    wait_until_ready: Callable[[], bool],
-    seconds: float,
-) -> int:
-    """Run the commands in this process, the daemon in the main thread, where signals arrive."""
-    from gz_onboard import cli
-
-    def the_rest() -> None:
-        if wait_until_ready():
-            for command in [page, replay]:
-                threading.Thread(target=cli.main, args=(command,), daemon=True).start()
-            cli.main([*dashboard, "--duration", str(seconds)])  # no signal can end it in a thread
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=the_rest, daemon=True).start()
-    return cli.main(daemon)
-
-
-def show_decoded(frames: Path, log: Path, dbc: Path) -> None:
-    """Print the last frame of each kind while the vehicle still sent, decoded by the cantools command."""
-    ended = max(frame[0] for batch in read_frames(log) for frame in batch if not frame[3] & TRANSMITTED) * 1e-9
-    lines = [line for line in frames.read_text().splitlines() if float(line[1 : line.index(")")]) <= ended]
-    last = {line.split()[2].partition("#")[0]: line for line in lines}
-    print(
-        "\n=== The ride has ended. Of a bus that falls silent the daemon says degraded, and soon that nothing is known."
+def draw(rows: Sequence[Row], picture: Path) -> None:
+    """The ranges over the kilometres ridden."""
+    figure = new_figure(8, 4.2)
+    axis = figure.add_axes((0.08, 0.12, 0.89, 0.78))
+    rule(axis)
+    ridden = [row.ridden for row in rows]
+    usual = [(row.ridden, row.usual) for row in rows if row.ridden > LEAST]
+    axis.fill_between(
+        ridden, [r.p10 for r in rows], [r.p90 for r in rows], color=BLUE, alpha=0.2, label="80 % interval"
     )
-    print(f"=== The last range frames of the ride: cantools decode {dbc.name} <{frames.name}")
-    decode = [str(BIN / "cantools"), "decode", str(dbc)]
-    text = subprocess.run(decode, input="\n".join(last.values()), check=True, capture_output=True, text=True).stdout
-    print(re.sub(r"\d+\.\d{9,}", lambda number: f"{float(number[0]):.9g}", text.strip()))  # not 2.8000000000000003
+    axis.plot(ridden, [row.range for row in rows], color=BLUE, label="range")
+    axis.plot(*zip(*usual, strict=True), color=ORANGE, label="usual gauge")
+    axis.plot(ridden, [row.left for row in rows], color=INK, linestyle="--", linewidth=1, label="really left")
+    axis.set_ylim(0, 1.2 * max(row.left for row in rows))
+    axis.set_xlim(0, ridden[-1])
+    axis.set_xlabel("km ridden", color=INK, fontsize=9, loc="left")
+    ordinate(axis, "km left")
+    legend(axis)
+    save(figure, picture)
 
 
 if __name__ == "__main__":

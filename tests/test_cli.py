@@ -119,7 +119,10 @@ def test_a_kernel_without_can(capsys: pytest.CaptureFixture[str], monkeypatch: p
 
     monkeypatch.setattr("can.Bus", none)
     for arguments in ["run"], ["replay", RIDE]:
-        assert "this kernel has no CAN sockets" in refused(capsys, *arguments, "--channel", "a")
+        said = refused(capsys, *arguments, "--channel", "a")
+        assert "this kernel has no CAN sockets" in said
+        assert "sudo modprobe can_raw" in said
+        assert "--interface udp_multicast --channel 239.74.163.2" in said
 
 
 VEHICLE = (ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
@@ -268,8 +271,10 @@ HELP = {parser.prog: parser.format_help for parser in parsers(command_line(COMMA
 
 
 @pytest.mark.parametrize("command", HELP)
-def test_every_page_of_help(command: str):
+def test_every_page_of_help_is_one_screen(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "100")
     page = HELP[command]()
+    assert len(page.splitlines()) <= 40
     assert page.startswith(f"usage: {command} ")
     assert "%%" not in page
     assert "%(" not in page
@@ -281,7 +286,7 @@ def test_a_wrong_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFix
         main([*command.split(), "--nonsense", RIDE, RIDE])
     assert ended.value.code == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"usage: gz-onboard {command} [-h] ")
+    assert said.startswith(f"usage: gz-onboard {command} [OPTION ...]")
     assert f"\ngz-onboard {command}: error: unrecognized arguments: --nonsense" in said
 
 

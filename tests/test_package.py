@@ -256,12 +256,22 @@ def test_a_command_of_the_lab_says_what_to_install(board, estimated, tmp_path, c
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("command", "package"), [(["mqtt", "localhost"], "paho-mqtt"), (["foxglove"], "foxglove-sdk")])
-def test_a_bridge_says_what_to_install(board, command, package):
+MULTICAST = "--interface", "udp_multicast", "--channel", "239.74.163.2"
+
+
+@pytest.mark.parametrize(
+    ("command", "package", "extra"),
+    [
+        (["mqtt", "localhost"], "paho-mqtt", "mqtt"),
+        (["foxglove"], "foxglove-sdk", "foxglove"),
+        (["run", *MULTICAST], "msgpack", "udp"),
+        (["replay", LOGS / "coastdown.blf", *MULTICAST], "msgpack", "udp"),
+    ],
+)
+def test_a_command_on_the_board_says_what_to_install(board, command, package, extra):
     (line,) = run(board / "gz-onboard", *command, status=2).stderr.splitlines()
-    extra = command[0]
     said = f"needs {package}, which is not installed: pip install 'gz-onboard[{extra}]'"
-    assert line == f"gz-onboard {extra}: {said}"
+    assert line == f"gz-onboard {command[0]}: {said}"
 
 
 def test_a_format_of_the_lab_says_what_to_install(board, tmp_path):

@@ -7,9 +7,12 @@ a daemon which never reads an MF4 file would pay at each start.
 from __future__ import annotations
 
 import importlib
+import os
+import socket
 import sys
+from typing import Any
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, require
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG
 
 
@@ -28,10 +31,17 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["NO_MSGPACK", "NO_SOCKETS", "PIP_MSGPACK", "can", "check_interface", "flagged"]
+__all__ = ["NO_SOCKETS", "can", "check_interface", "flagged", "open_bus"]
 
-NO_MSGPACK, PIP_MSGPACK = "msgpack not installed", "; pip install msgpack"  # of `udp_multicast`
-NO_SOCKETS = "this kernel has no CAN sockets (AF_CAN)"  # what EAFNOSUPPORT of socketcan means
+MULTICAST = "udp_multicast"
+ALL_GROUPS = {
+    socket.AF_INET: (socket.IPPROTO_IP, 49),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
+}  # IP(V6)_MULTICAST_ALL
+NO_SOCKETS = (  # what EAFNOSUPPORT of socketcan means
+    "this kernel has no CAN sockets (AF_CAN): load them (sudo modprobe can_raw), or join processes without by "
+    "--interface udp_multicast --channel 239.74.163.2"
+)
 
 
 def check_interface(name: str) -> None:
@@ -39,6 +49,22 @@ def check_interface(name: str) -> None:
     if name not in can.VALID_INTERFACES:
         known = sorted(can.VALID_INTERFACES)
         raise InputError(f"--interface {name}: unknown{nearest(name, known)}; known are {', '.join(known)}")
+    require("msgpack", name == MULTICAST)
+
+
+def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:
+    """python-can's bus; of `udp_multicast`, where the channel may be GROUP:PORT, with the frames of its group only.
+
+    Linux gives a socket those of every group that any process of the machine has joined on its port.
+    """
+    if interface != MULTICAST:
+        return can.Bus(channel=channel, interface=interface, **options)
+    group, _, port = channel.partition(":") if channel.count(":") == 1 else (channel, "", "")
+    options |= {"port": int(port)} if port else {}
+    bus = can.Bus(channel=group, interface=interface, **options)
+    with socket.socket(fileno=os.dup(bus.fileno())) as same:
+        same.setsockopt(*ALL_GROUPS[same.family], 0)
+    return bus
 
 
 def flagged(message: can.Message) -> int:

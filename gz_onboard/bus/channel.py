@@ -15,7 +15,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import NO_MSGPACK, NO_SOCKETS, PIP_MSGPACK, can, check_interface, flagged
+from gz_onboard.bus._can import MULTICAST, NO_SOCKETS, can, check_interface, flagged, open_bus
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
@@ -29,7 +29,7 @@ BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 fr
 MOST, READ_S = 5000, 0.08
 """Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
 RETRY = 1.0  # s between attempts to open a bus that is down
-ECHOING = ("udp_multicast",)  # interfaces that give what is sent back to the sender
+ECHOING = (MULTICAST,)  # interfaces that give what is sent back to the sender
 ECHO_S = 2.0  # so long after it was sent
 _FRAME = struct.Struct("=IB3x8s")
 _FD_FRAME = struct.Struct("=IBB2x64s")
@@ -69,8 +69,7 @@ class CanChannel:
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
-            hint = PIP_MSGPACK if str(error) == NO_MSGPACK else ""
-            raise InputError(f"--interface {self.interface}: {error}{hint}") from error
+            raise InputError(f"--interface {self.interface}: {error}") from error
         except (OSError, can.CanError) as error:
             if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:
                 raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error
@@ -87,7 +86,7 @@ class CanChannel:
                 }
                 for i in self._identifiers
             ]
-        bus: Any = can.Bus(channel=self.name, interface=self.interface, can_filters=filters, **self._options)
+        bus: Any = open_bus(self.interface, self.name, can_filters=filters, **self._options)
         self._bus = bus
         raw = getattr(bus, "socket", None)
         if self.interface == "socketcan" and isinstance(raw, socket.socket):

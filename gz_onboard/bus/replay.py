@@ -282,20 +282,21 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import NO_MSGPACK, NO_SOCKETS, PIP_MSGPACK, can, check_interface
+    from gz_onboard.bus._can import NO_SOCKETS, can, check_interface, open_bus
 
     check_interface(interface)
     buses: list[can.BusABC] = []
     for name in names:
         try:
-            buses.append(can.Bus(channel=name, interface=interface))
+            buses.append(open_bus(interface, name))
         except (OSError, can.CanError, ImportError, ValueError) as error:
             for bus in buses:
                 bus.shutdown()
             there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
             why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
-            hint = PIP_MSGPACK if str(error) == NO_MSGPACK else nearest(name, there)
-            raise InputError(f"--channel {name}: cannot be opened by {interface}: {why}{hint}") from None
+            raise InputError(
+                f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
+            ) from None
     if not buses:
         raise InputError("--channel: no channel is named")
     return buses

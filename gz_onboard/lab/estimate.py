@@ -26,7 +26,7 @@ from gz_onboard.lab.estimate_state import go_on, held
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, UNFIT, RideSummary, gains
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
-from gz_onboard.offline.results import Failure, clock, explain_keys, number, text_rows, write_json
+from gz_onboard.offline.results import Failure, clock, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
@@ -46,7 +46,6 @@ KEYS = descriptions(RideSummary)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
-    explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle", "--vehicle-id")
     add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown, also where rides.json says it)")
     add_shared(parser, "--route")

@@ -19,7 +19,7 @@ from gz_onboard.lab.validate_soc import soc_text
 from gz_onboard.lab.validate_thesis import of_component
 from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
-from gz_onboard.offline.results import explain_keys, write_json
+from gz_onboard.offline.results import write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
@@ -66,7 +66,6 @@ def pool(rides: Sequence[ValidatedRide]) -> Pooled:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
-    explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle", "--payload", "--output", "--json")
     parser.add_argument(
         "--markdown",

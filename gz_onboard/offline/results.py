@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -27,15 +25,6 @@ class Failure:
 
     file: Annotated[str, "the log"]
     error: Annotated[str, "why"]
-
-
-def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: Mapping[str, str]) -> None:
-    """The keys of a JSON result and their meaning, below the options in the help."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    wrap = textwrap.TextWrapper(_WIDTH, subsequent_indent=" " * 23)
-    rows = "\n".join(wrap.fill(f"  {key:20} {meaning}") for key, meaning in keys.items())
-    before = f"{parser.epilog}\n\n" if parser.epilog else ""
-    parser.epilog = f"{before}JSON keys of {of}, version {version}:\n{rows}"
 
 
 def write_json(file: str | None, version: int | None, result: object) -> None:

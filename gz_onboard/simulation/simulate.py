@@ -15,7 +15,7 @@ from typing import Any
 
 from gz_onboard.constants import HOUR, WH_PER_KM
 from gz_onboard.errors import OK, InputError, not_an_input, require
-from gz_onboard.offline.results import explain_keys, times, write_json
+from gz_onboard.offline.results import times, write_json
 from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.simulation.frames import Dropouts, check_output, messages_sent
@@ -25,7 +25,7 @@ from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_pla
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
+from gz_onboard.simulation.summary import SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, find_vehicle
@@ -35,7 +35,6 @@ _MOST_HOURS = 48.0  # of riding until empty
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard simulate``."""
-    explain_keys(parser, "the summary", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
     what = "name of a built-in drive cycle, CSV of a cycle, CSV or GPX of a route, or log of a ride to be replayed"
     add("what", metavar="WHAT", help=what)
@@ -53,15 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
     dyno = "on a chassis dynamometer: inertia of the roller [kg], force A + B·V + C·V² [N] at a speed V [m/s]"
     add("--dyno", metavar="KG[,A,B,C]", help=dyno)
-    bends = "chassis model, which says what bends cost; straight: nothing (default: %(default)s)"
-    add("--chassis", choices=tuple(MODELS), default="straight", help=bends)
-    predictive = "of a recorded ride: a rider model follows its speed, instead of replaying throttle and brake"
+    bends = f"chassis model: {', '.join(MODELS)}; straight loses nothing in bends (default: %(default)s)"
+    add("--chassis", choices=tuple(MODELS), default="straight", metavar="MODEL", help=bends)
+    predictive = "follow the speed of a recorded ride instead of replaying its throttle and brake"
     add("--predictive", action="store_true", help=predictive)
-    sweep = "ride it with other values of a parameter, battery.cells_parallel or battery.cells_series; at most twice"
-    add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]", help=sweep)
+    sweep = "vary a parameter, battery.cells_parallel or battery.cells_series; at most twice"
+    add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:N]", help=sweep)
     add_shared(parser, "--output", "--json")
-    kinds = "of the time series (default: parquet) or of the pictures (default: png); may be given once for each"
-    add("--format", action=_Format, choices=(*FORMATS, *PICTURE_FORMATS), default="parquet", help=kinds)
+    kinds = (
+        f"time series: {', '.join(FORMATS)} (default: parquet); pictures: {', '.join(PICTURE_FORMATS)} (default: png)"
+    )
+    add("--format", action=_Format, choices=(*FORMATS, *PICTURE_FORMATS), default="parquet", metavar="NAME", help=kinds)
     parser.set_defaults(picture_format=PICTURE_FORMATS[0])
     add("--no-series", action="store_true", help="write no time series")
     add_shared(parser, "--no-plot")

@@ -195,7 +195,7 @@ def test_joined_mid_ride_the_sd_covers_the_polarisation(soc, temperature):
         rows = follow(e, scooter.live(130, 11.0), scooter)
         assert worst(rows) < 3
         first = next(row for _, row in rows if row.soc is not None)
-        assert 0.018 < first.soc_sd < (0.24 if temperature < 10 and soc < 0.3 else 0.16)  # as the README says
+        assert 0.018 < first.soc_sd < (0.24 if temperature < 10 and soc < 0.3 else 0.16)  # as docs/limits.md says
         scooter.away(17, 11.0)
 
 

@@ -20,7 +20,7 @@ from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
 from gz_onboard.lab.calibrate.result import LackingError, Result
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output, write_vehicle
-from gz_onboard.offline.results import explain_keys, write_json
+from gz_onboard.offline.results import write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared
 from gz_onboard.physics.effect import load_effect
@@ -105,16 +105,11 @@ def _known_by_now(base: Path, results: Sequence[Result], file: Path) -> Vehicle:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``gz-onboard calibrate``."""
     parser.epilog = "\n".join(
-        ["what to calibrate, and from which data:"]
+        ["procedures:"]
         + [f"  {'all':<12} everything that the manifest {manifest.NAME} of a folder names"]
-        + [line for name, procedure in PROCEDURES.items() for line in _help(name, procedure)]
-        + [
-            "",
-            "Tables are CSV (.csv, .csv.gz) or Parquet with the unit in the name of a column: time_s, current_A.",
-            "Rides are logs in any format that `gz-onboard estimate` reads. See docs/calibration.md.",
-        ]
+        + [f"  {name:<12} {procedure.what}" for name, procedure in PROCEDURES.items()]
+        + ["", "Tables have the unit in the name of a column: time_s, current_A. The data of each: docs/commands.md."]
     )
-    explain_keys(parser, "a calibration", report.VERSION, report.KEYS)
     add = parser.add_argument
     add("what", metavar="WHAT", help="a procedure, or all")
     data = "files, or for rides folders of logs; for `all` a folder with its manifest"
@@ -128,16 +123,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--report", "--json", "--quiet")
 
 
-def _help(name: str, procedure: Procedure) -> Iterator[str]:
-    yield f"  {name:<12} {procedure.what}"
-    for slot, s in procedure.slots.items():
-        key = "DATA" if slot == "data" else f"--with {slot}=FILE"
-        yield f"  {'':<12}   {key}: {s.what}{'' if s.least else ' (may be left out)'}"
-    if plain := _plain(procedure):
-        yield f"  {'':<12}   --set {', '.join(f'{k}={v}' for k, v in plain.items())}"
-
-
-def _plain(procedure: Procedure) -> dict[str, float | str]:
+def plain_options(procedure: Procedure) -> dict[str, float | str]:
     """The options that a command line may give; one for each file is for a manifest."""
     return {name: default for name, default in procedure.options.items() if isinstance(default, float | str)}
 
@@ -256,7 +242,7 @@ def known_procedure(name: str) -> None:
 def options_of(texts: Sequence[str], procedure: str) -> dict[str, Option]:
     """The options of a procedure, each given as NAME=VALUE. InputError for one that it has not, or a wrong value."""
     found: dict[str, Option] = {}
-    options = _plain(PROCEDURES[procedure])
+    options = plain_options(PROCEDURES[procedure])
     for text in texts:
         name, _, value = text.partition("=")
         if name not in options:

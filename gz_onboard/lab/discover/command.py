@@ -19,15 +19,13 @@ from gz_onboard.lab.discover.detectability import implausible_rides, missing_res
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.extension import write_model
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.result import VERSION, Report
 from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import distinct_names, explain_keys, write_json
+from gz_onboard.offline.results import distinct_names, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
-from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
@@ -60,7 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--seed")
     add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
     add_shared(parser, "--quiet")
-    explain_keys(parser, "the report", VERSION, descriptions(Report))
 
 
 def run(arguments: argparse.Namespace) -> int:

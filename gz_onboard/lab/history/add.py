@@ -22,9 +22,8 @@ from gz_onboard.lab.history.text import HISTORY_VERSION, ride_text
 from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import Failure, explain_keys, leap_text, write_json
+from gz_onboard.offline.results import Failure, leap_text, write_json
 from gz_onboard.offline.samples import facts_of, ride_name
-from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.routes.ahead import read_ahead
@@ -63,7 +62,6 @@ class AddedRides:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard history add``."""
-    explain_keys(parser, "the result", HISTORY_VERSION, descriptions(AddedRides))
     text = "logs of gz-onboard run or estimate, or of raw frames, which are estimated first; or folders of them"
     add_shared(parser, "logs", help=text)
     parser.add_argument(

@@ -15,11 +15,10 @@ from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.lab.estimate_table import FORMATS, check_table
 from gz_onboard.lab.history.choice import Choice, period, read_rides
 from gz_onboard.lab.history.picture import draw_history
-from gz_onboard.lab.history.ride import COLUMNS, MEANING, KeptRide
+from gz_onboard.lab.history.ride import COLUMNS, KeptRide
 from gz_onboard.lab.history.text import HISTORY_VERSION, overview_text
 from gz_onboard.lab.history.totals import LearnedAt, NumberedRide, Overview, Totals, overviews
-from gz_onboard.offline.results import explain_keys, write_json
-from gz_onboard.offline.schema import descriptions
+from gz_onboard.offline.results import write_json
 from gz_onboard.offline.style import picture_format, save
 from gz_onboard.options import add_shared
 
@@ -27,7 +26,7 @@ _KINDS: dict[str, type] = {"number": int, **{name: (get_args(kind) or (kind,))[0
 
 
 @dataclass(frozen=True)
-class _Shown:
+class Shown:
     """Of a vehicle in the JSON."""
 
     vehicle: Annotated[str, "what it is called in the history"]
@@ -40,10 +39,6 @@ class _Shown:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard history show``."""
-    explain_keys(parser, "a vehicle, in `vehicles`", HISTORY_VERSION, descriptions(_Shown))
-    explain_keys(parser, "a month, or of a temperature", HISTORY_VERSION, descriptions(Totals))
-    explain_keys(parser, "what was learned", HISTORY_VERSION, descriptions(LearnedAt))
-    explain_keys(parser, "a ride", HISTORY_VERSION, MEANING)
     add = parser.add_argument
     add("--since", metavar="DATE", help="rides from then on: a year, month or day, such as 2025-06")
     add("--until", metavar="DATE", help="rides until then, that day or month among them")
@@ -112,6 +107,6 @@ def _date(ride: KeptRide) -> str | None:
     return f"{datetime.fromtimestamp(ride.start_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}" if ride.dated else None
 
 
-def _in_json(of: Overview) -> _Shown:
+def _in_json(of: Overview) -> Shown:
     rides: list[dict[str, object]] = [{"number": one.number, **asdict(one.ride)} for one in of.rides]
-    return _Shown(of.vehicle, of.total, of.months, of.temperatures, of.learned, rides)
+    return Shown(of.vehicle, of.total, of.months, of.temperatures, of.learned, rides)

@@ -14,8 +14,7 @@ from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.finding import Looks
 from gz_onboard.lab.vehicle.maps import WARM, efficiency_maps, fit_of
 from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.results import Failure, explain_keys, write_json
-from gz_onboard.offline.schema import descriptions
+from gz_onboard.offline.results import Failure, write_json
 from gz_onboard.offline.style import save
 from gz_onboard.options import LOG_SUFFIXES, add_shared, number
 from gz_onboard.progress import progress_bar
@@ -29,7 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     new.add_arguments(parts.add_parser("new", help=about, description=about, allow_abbrev=False))
     about = "does a vehicle file fit a log? what each role has, what looks right and what wrong, what is missing"
     check = parts.add_parser("check", help=about, description=about, allow_abbrev=False)
-    explain_keys(check, "a log", CHECK_VERSION, descriptions(Checked))
     check.add_argument("vehicle", metavar="NAME|TOML", help="name of a built-in vehicle, or a vehicle file")
     add_shared(check, "logs", nargs="*")
     text = "leave out the run through the daemon's pipeline, which takes most of the time"

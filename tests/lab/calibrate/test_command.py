@@ -137,10 +137,7 @@ def test_help_names_every_procedure(capsys):
     with pytest.raises(SystemExit):
         main(["calibrate", "--help"])
     told = capsys.readouterr().out
-    for name, procedure in PROCEDURES.items():
-        assert f"  {name}" in told
-        for slot in procedure.slots:
-            assert slot == "data" or f"--with {slot}=FILE" in told
+    assert all(f"  {name}" in told for name in PROCEDURES)
 
 
 def test_only_what_a_vehicle_file_holds_is_written():

@@ -1,0 +1,70 @@
+"""What is too long for ``--help``: calibrate's data and the keys of each JSON result, at the end of docs/commands.md.
+
+python docs/reference.py    # writes them anew
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from gz_onboard.lab import estimate, validate
+from gz_onboard.lab.calibrate import report
+from gz_onboard.lab.calibrate.command import plain_options
+from gz_onboard.lab.calibrate.procedures import PROCEDURES
+from gz_onboard.lab.discover.result import VERSION as DISCOVER_VERSION
+from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.history.add import AddedRides
+from gz_onboard.lab.history.ride import MEANING
+from gz_onboard.lab.history.show import Shown
+from gz_onboard.lab.history.text import HISTORY_VERSION
+from gz_onboard.lab.history.totals import LearnedAt, Totals
+from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked
+from gz_onboard.offline.schema import descriptions
+from gz_onboard.simulation import summary as simulated
+
+PAGE = Path(__file__).with_name("commands.md")
+MARK = "<!-- made by docs/reference.py from here on -->"
+RESULTS: tuple[tuple[str, int, Mapping[str, str]], ...] = (
+    ("estimate: a ride", estimate.SUMMARY_VERSION, estimate.KEYS),
+    ("simulate", simulated.SUMMARY_VERSION, simulated.KEYS),
+    ("validate: a ride", validate.SUMMARY_VERSION, validate.KEYS),
+    ("calibrate", report.VERSION, report.KEYS),
+    ("discover", DISCOVER_VERSION, descriptions(Report)),
+    ("vehicle check: a log", CHECK_VERSION, descriptions(Checked)),
+    ("history add", HISTORY_VERSION, descriptions(AddedRides)),
+    ("history show: a vehicle", HISTORY_VERSION, descriptions(Shown)),
+    ("history show: a month or temperature", HISTORY_VERSION, descriptions(Totals)),
+    ("history show: what was learned", HISTORY_VERSION, descriptions(LearnedAt)),
+    ("history show: a ride", HISTORY_VERSION, MEANING),
+)
+
+
+def tables() -> Iterator[str]:
+    """The lines behind the mark."""
+    yield "\n## Data of calibrate\n"
+    for name, procedure in PROCEDURES.items():
+        yield f"- `{name}`: {procedure.what}"
+        for slot, data in procedure.slots.items():
+            key = "`DATA`" if slot == "data" else f"`--with {slot}=FILE`"
+            yield f"  - {key}: {data.what}{'' if data.least else ' (may be left out)'}"
+        yield from (f"  - `--set {option}={value}`" for option, value in plain_options(procedure).items())
+    yield "\n## Keys of JSON results"
+    for of, version, keys in RESULTS:
+        yield f"\n### {of}\n\nVersion {version}.\n\n| key | meaning |\n| --- | --- |"
+        yield from (f"| `{key.strip()}` | {escaped(text)} |" for key, text in keys.items())
+
+
+def escaped(text: str) -> str:
+    """A text as a cell of a table holds it."""
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def page() -> str:
+    """The page with what is behind the mark made anew."""
+    head, mark, _ = PAGE.read_text(encoding="utf-8").partition(MARK)
+    return "\n".join([head + mark, *tables(), ""])
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
