@@ -11,7 +11,7 @@ from tests.lab.short_logs import short_log
 
 EMPTY = "is empty, a file of 0 bytes; copy or record it again"
 MISSING = "cannot be read: No such file or directory (did you mean 'ride.blf'?)"
-ANOTHER = "knows none of its 40 frames (identifiers 123, ...); give the vehicle that it is of, or begin"
+ANOTHER = "knows none of its 40 frames (identifiers 0x123, ...); give the vehicle that it is of, or begin"
 NO_SUFFIX = "is not a log that can be read: it ends in '.txt', and it begins with 'hello'; logs are .mcap, .blf"
 NO_FOLDER = "cannot be written: there is no folder nowhere; make it"
 READING = {

@@ -33,7 +33,9 @@ def received(channel: CanChannel) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("other", "same"), [(f"239.74.163.3:{PORT}", False), (f"{GROUP}:{PORT + 1}", False), (f"{GROUP}:{PORT}", True)]
+    ("other", "same"),
+    [(f"239.74.163.3:{PORT}", False), (f"{GROUP}:{PORT + 1}", False), (f"{GROUP}:{PORT}", True)],
+    ids=["group", "port", "same"],
 )
 def test_only_its_own_group_and_port_are_heard(other, same):
     frame: Frame = (0, 0x123, b"range", 0)
