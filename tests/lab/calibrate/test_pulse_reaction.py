@@ -1,7 +1,7 @@
 """Charge transfer out of pulse tests: of a plant whose double layer is charged by a current that goes as sinh."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -56,10 +56,9 @@ def test_a_cell_without_it_has_none():
 
 def test_it_may_take_all_of_r0():
     levels = [(4.0, 10, 2.5), (0.0, 40, 5), (-1.0, 10, 2.5), (0.0, 40, 5), (1.0, 700, 25), (0.0, 1400, 50)]
-    cell = {"r0": 0.005, "pairs": ((0.005, 30.0),), "cold": 0.0, "reaction": 0.06, "layer": 0.0, "activation": 3200.0}
-    tests = [
-        Plant(**cell, seed=k).run([(0.0, 600, 100), *8 * levels], t, f"{t:g}.csv") for k, t in enumerate((25.0, 40.0))
-    ]
+    cell = partial(Plant, r0=0.005, pairs=((0.005, 30.0),), cold=0.0, reaction=0.06, layer=0.0, activation=3200.0)
+    runs = enumerate((25.0, 40.0))
+    tests = [cell(seed=k).run([(0.0, 600, 100), *8 * levels], t, f"{t:g}.csv") for k, t in runs]
     ocv, capacity = slow()
     other = replace(ocv, value=ocv.value + 0.01 * np.sin(6 * ocv.axes["soc"]))  # of a cell that is much alike
     result = pulse.calibrate(tests, other, capacity)
