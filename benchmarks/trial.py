@@ -137,7 +137,7 @@ def judge_healthy(seeds: Sequence[int]) -> list[Row]:
 
 def alarm(row: Row) -> bool:
     """Whether a healthy set was told to have something that it has not."""
-    return bool(reported(row) - LACKS[row["against"]]) or row["unknown"] is not None
+    return bool(reported(row) - LACKS[row["against"]]) or row["verdict"] in ("unknown", "inconclusive")
 
 
 def healthy_document(rows: Sequence[Row], first: int, commit: str) -> str:

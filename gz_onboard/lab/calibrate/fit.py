@@ -154,7 +154,7 @@ def _check(names: tuple[str, ...], jacobian: Array, points: int, size: Array) ->
         raise InputError(f"{points} points are too few for {len(names)} parameters ({', '.join(names)})")
     for name, length in zip(names, size, strict=True):
         if not length > 0:
-            raise InputError(f"the data say nothing of {name}: no point changes with it")
+            raise InputError(f"{name} is not identifiable from these data: no point changes with it")
     if (scaled := np.linalg.svd(jacobian / size, compute_uv=False))[-1] < 1e-9 * scaled[0]:
         direction = np.linalg.svd(jacobian / size)[2][-1]
         tied = [name for name, part in zip(names, direction, strict=True) if abs(part) > 0.1]
