@@ -73,9 +73,10 @@ def _header(found: Discovery) -> list[str]:
 def _causes(report: Report) -> list[str]:
     lines = []
     for c in report.causes:
+        change = "" if c.change == c.value else f"; change {with_unit(c.change, c.unit, '+.4g')}"
         lines.append(
             f"  {c.name:20} {c.parameter} = {with_unit(c.value, c.unit)} "
-            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}; change {with_unit(c.change, c.unit, '+.4g')}), "
+            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}{change}), "
             f"{c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
         )
         for name, other in c.others.items():

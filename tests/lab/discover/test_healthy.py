@@ -186,6 +186,7 @@ def test_alarms_are_counted_as_they_are():
     assert not alarm(row("file", ["cornering_drag"]))
     assert alarm(row("file", ["cornering_drag", "ocv_hysteresis"]))
     assert alarm(row("baseline", [], curve))
+    assert alarm(row("baseline", []) | {"verdict": "inconclusive"})
     text = healthy_document([row("baseline", []), row("baseline", ["headwind"]), row("file", [])], 7, "abc")
     assert "| baseline of eight rides | 1 of 2, 50 %" in text
     assert "| the vehicle file alone | 0 of 1, 0 %" in text
