@@ -73,11 +73,11 @@ def body(found: Discovery, picture: Picture = lambda figure, _: _picture(figure)
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{image}{note}</details>")
     parts += [
-        "<h2>Which cause</h2>" + picture(ranking(report), "ranking"),
-        "<h2>What it is worth: rides held out of the fit</h2>" + _gain(report),
+        "<h2>Candidates by score</h2>" + picture(ranking(report), "ranking"),
+        "<h2>Errors on held-out rides</h2>" + _gain(report),
     ]
     if report.unknown:
-        parts.append("<h2>What has no name</h2>" + picture(curve(report.unknown), "unknown"))
+        parts.append("<h2>Unexplained residual</h2>" + picture(curve(report.unknown), "unknown"))
     parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
     return "\n".join(parts)
 
@@ -145,15 +145,15 @@ def _causes(report: Report) -> str:
         if c.varies:
             text += f"<p>The {readable(c.name)} {varying(report.constancy, c.name)}: no model is extended with it.</p>"
     for group in report.ambiguous:
-        text += f"<p><b>Not told apart by these rides:</b> {', '.join(readable(name) for name in group)}.</p>"
+        text += f"<p><b>Ambiguous:</b> {', '.join(readable(name) for name in group)}.</p>"
     if report.unknown:
         u = report.unknown
         text += f"<p><b>No candidate explains</b> {in_words(u)}: {u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
         if u.denies:
             names = ", ".join(readable(name) for name in u.denies)
-            text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
+            text += f"<p><b>Rejected:</b> {names}, which would not act alike everywhere.</p>"
     for sentence in strain_words(report.strain) if report.strain else ():
-        text += f"<p><b>Cannot be:</b> {html.escape(sentence)}.</p>"
+        text += f"<p><b>Implausible:</b> {html.escape(sentence)}.</p>"
     return text
 
 
@@ -243,7 +243,7 @@ def _constancy(report: Report) -> str:
         return ""
     rows = [[readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}", likeness(s)] for s in splits]
     return (
-        "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
+        "<h2>Constancy of the causes</h2><p>Half the difference of left and right bends, or of the upper "
         "and lower half of a quantity, or of a ride and the others, over the mean: 0 for the cause itself, ±1 for what "
         "acts in one half only.</p>" + html_table(["cause", "over", "ratio", "chi-squared", "judged"], rows, (2, 3))
     )
@@ -259,7 +259,7 @@ def _limits(report: Report) -> str:
             rows.append([readable(name), limit.parameter, with_unit(limit.change, limit.unit, ".3g"), share])
     heads = ["cause", "parameter", "change", "of the energy"]
     return (
-        "<h2>What these rides could show</h2><p>The least change that would be found half the time, were it alone.</p>"
+        "<h2>Detection limits</h2><p>The least change that would be found half the time, were it alone.</p>"
         f"<details><summary>Every candidate</summary>{html_table(heads, rows, (2, 3))}"
         "</details>"
     )

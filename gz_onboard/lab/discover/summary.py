@@ -85,15 +85,15 @@ def _causes(report: Report) -> list[str]:
         if c.varies:
             lines.append(f"  {'':20} {varying(report.constancy, c.name)}: no model is extended with it")
     for group in report.ambiguous:
-        lines.append(f"  not told apart:      {', '.join(group)}")
+        lines.append(f"  ambiguous:           {', '.join(group)}")
     if report.unknown:
         u = report.unknown
-        lines.append(f"  no name:             {in_words(u)}, {u.share:+.1%} of the energy, score {u.score:.0f}")
+        lines.append(f"  unexplained:         {in_words(u)}, {u.share:+.1%} of the energy, score {u.score:.0f}")
         if u.denies:
-            lines.append(f"  denied:              {', '.join(u.denies)}, which would not act alike everywhere")
+            lines.append(f"  rejected:            {', '.join(u.denies)}, which would not act alike everywhere")
     return [
         *lines,
-        *(f"  cannot be:           {text}" for text in (strain_words(report.strain) if report.strain else ())),
+        *(f"  implausible:         {text}" for text in (strain_words(report.strain) if report.strain else ())),
     ]
 
 

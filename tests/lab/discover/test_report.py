@@ -159,7 +159,7 @@ def test_the_page_says_it_all(found: Discovery, tmp_path: Path):
         "Ride &lt;more&gt;.",
         "a note",
         "a&lt;b",
-        "What has no name",
+        "Unexplained residual",
         "+0.5 to +1.5",
         "dragging brake",
     )
