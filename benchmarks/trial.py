@@ -137,7 +137,8 @@ def judge_healthy(seeds: Sequence[int]) -> list[Row]:
 
 def alarm(row: Row) -> bool:
     """Whether a healthy set was told to have something that it has not."""
-    return bool(reported(row) - LACKS[row["against"]]) or row["unknown"] is not None
+    more = row["unknown"] is not None or row["verdict"] in ("unknown", "inconclusive")
+    return bool(reported(row) - LACKS[row["against"]]) or more
 
 
 def healthy_document(rows: Sequence[Row], first: int, commit: str) -> str:

@@ -76,7 +76,7 @@ def test_the_cause_is_cornering_and_nothing_stands_in_for_it(ran: tuple[Path, li
     verdict, cause = (line for line in whole.splitlines() if line.startswith(("verdict", "  cornering_drag")))
     assert "cause" in verdict
     assert "cornering_compliance" in cause
-    assert not re.search(r"not told apart:.*cornering_drag", whole)
+    assert not re.search(r"ambiguous:.*cornering_drag", whole)
 
 
 def test_the_models_written_differ_as_little_as_their_intervals_say(ran: tuple[Path, list[tuple[str, str]]]):

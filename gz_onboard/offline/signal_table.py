@@ -10,7 +10,6 @@ is done with it too: no command knows of tables.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +26,7 @@ from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES, Frame
+from gz_onboard.routes.columns import separated
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -123,17 +123,10 @@ def _csv(file: Path) -> tuple[list[str], Rows]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", "replace")
-    first = text.partition("\n")[0]
-    separator = max(",;\t", key=first.count)
-    reader = csv.reader(text.splitlines(), delimiter=separator)
-    header = next(reader, [])
-    rows = []
-    for row in reader:
-        if not any(map(str.strip, row)):
-            continue
+    (_, header), *rows = separated(text) or [(1, [])]
+    for line, row in rows:
         if len(row) != len(header):
-            raise InputError(f"{file}:{reader.line_num}: {len(row)} cells for {len(header)} columns")
-        rows.append((reader.line_num, row if separator == "," else [cell.replace(",", ".") for cell in row]))
+            raise InputError(f"{file}:{line}: {len(row)} cells for {len(header)} columns")
     return header, rows
 
 

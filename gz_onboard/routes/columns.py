@@ -16,6 +16,7 @@ from gz_onboard.errors import InputError, nearest, shown, unreadable
 LEAST_ROWS = 2
 UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
 _KMH = re.compile(r"km?/h|km?ph", re.I)
+_DECIMAL = re.compile(r"^(\s*[-+]?\d*),(\d+(?:[eE][-+]?\d+)?\s*)$")
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,21 @@ def csv_rows(file: Path) -> list[tuple[int, list[str]]]:
     """(line, fields) of each line of a CSV `file` (also .csv.gz) but empty ones. InputError if it cannot be read."""
     try:
         with (gzip.open if file.suffix == ".gz" else open)(file, "rt", encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            return [(reader.line_num, row) for row in reader if row]
+            return separated(stream.read())
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: not a CSV file: {error}") from error
     except (OSError, EOFError, zlib.error) as error:
         raise unreadable(file, error) from error
+
+
+def separated(text: str) -> list[tuple[int, list[str]]]:
+    """(line, fields) of each line of `text` but empty ones, separated by what the header has most of: commas,
+    semicolons or tabs. A comma in a number is a decimal one where it separates nothing.
+    """
+    mark = max(",;\t", key=text.partition("\n")[0].count)
+    reader = csv.reader(text.splitlines(keepends=True), delimiter=mark)
+    rows = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
+    return rows if mark == "," else [(line, [_DECIMAL.sub(r"\1.\2", field) for field in row]) for line, row in rows]
 
 
 def read_columns(file: Path, known: Collection[str]) -> Columns:
@@ -65,7 +75,7 @@ def read_columns(file: Path, known: Collection[str]) -> Columns:
     Blank lines are passed over. Raises InputError, naming file, line and column, if the file cannot be read, a
     column is unknown or there twice, a row has too few or too many fields, or a field is no finite number.
     """
-    records = [(line, record) for line, record in csv_rows(file) if any(field.strip() for field in record)]
+    records = csv_rows(file)
     if not records:
         raise InputError(f"{file}: is empty; its first line must name columns out of {', '.join(known)}")
     line, header = records[0][0], [name.strip() for name in records[0][1]]

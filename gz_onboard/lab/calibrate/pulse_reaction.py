@@ -17,7 +17,15 @@ from scipy.stats import f as f_distribution
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_circuit import FOUND, NO_REACTION, Reaction, hats
-from gz_onboard.lab.calibrate.cell_fit import CORRELATED, TIMES, filtered, fit_branches, smoothness, weighted_columns
+from gz_onboard.lab.calibrate.cell_fit import (
+    CORRELATED,
+    LEAST,
+    TIMES,
+    filtered,
+    fit_branches,
+    smoothness,
+    weighted_columns,
+)
 from gz_onboard.lab.calibrate.pulse_test import Tested, moved_pieces, ocv_and_slope
 from gz_onboard.lab.calibrate.result import Result
 
@@ -63,7 +71,9 @@ def charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, soc: Ar
         doubt = (x[1] - known[1].prior) / known[1].prior_sd, (x[2] - np.log(known[2].prior)) / TIME_SD
         return sum(p.cost(reaction(x)) for p in problems) + float(np.sum(np.square(doubt)))
 
-    start = np.array([np.log(START_SHARE * np.median(first[-1][0])), known[1].prior, np.log(known[2].prior)])
+    start = np.array(
+        [np.log(START_SHARE * max(np.median(first[-1][0]), LEAST)), known[1].prior, np.log(known[2].prior)]
+    )
     simplex = start + np.vstack([np.zeros(3), np.diag(10 * STEPS)])
     options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.1, "maxfev": MOST_TRIALS}
     found = minimize(cost, start, method="Nelder-Mead", options=options)

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from gz_onboard.arrays import Array
 from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
-from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
+from gz_onboard.lab.calibrate.cell_fit import LEAST, Pieces, filtered, fit_branches, pieces
 from gz_onboard.lab.calibrate.ocv import FLAT
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
@@ -133,11 +133,11 @@ def moved_pieces(
     fitted = [fit_branches(x) for x in split(activation)]
     middle = (soc > 0.15) & (soc < 0.95)
     inverse = np.array([1 / (t.temperature + KELVIN) for t in tests])
-    logs = [
-        np.log([np.median(np.sum(f.resistance[part][:, middle], axis=0)) for f in fitted])
-        for part in (slice(0, 1), slice(1, None))
-    ]
-    slopes = [np.clip(np.gradient(x, inverse), 0, 8000) for x in logs]
+    slopes = []
+    for part in (slice(0, 1), slice(1, None)):
+        size = np.array([np.median(np.sum(f.resistance[part][:, middle], axis=0)) for f in fitted])
+        seen = size.min() > LEAST  # charge transfer may leave nothing of R0, whose activation nobody sees then
+        slopes.append(np.clip(np.gradient(np.log(size), inverse), 0, 8000) if seen else np.zeros(len(size)))
     activation = [(float(a), float(b)) for a, b in zip(*slopes, strict=True)]
     return split(activation), activation
 

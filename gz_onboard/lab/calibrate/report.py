@@ -125,7 +125,7 @@ def write_report(file: Path, title: str, results: Sequence[Result], trouble: Exc
     body += [f'<p class="no">Not finished: {html.escape(str(trouble))}</p>'] if trouble else []
     body += [_section(result) for result in results]
     if rows := thesis.compare(results):
-        body.append(f"<h2>The thesis and ours</h2>{html_table(thesis.HEAD, rows, [1, 2, 3])}")
+        body.append(f"<h2>Comparison with the thesis</h2>{html_table(thesis.HEAD, rows, [1, 2, 3])}")
     write_page(file, title, body)
 
 

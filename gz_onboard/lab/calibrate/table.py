@@ -6,6 +6,9 @@ A column is called quantity_unit; ``quantity[unit]`` and ``quantity (unit)`` are
 quantity, in SI units and degC. For tables of other people a mapping says which column is what:
 
     columns = { time = "t_s", voltage = "v_V", current = { column = "i_A", scale = -1 } }
+
+What a table has no column for, but is the same in all of it, is stated: ``cell_temperature = { value = 25, unit =
+"degC" }``.
 """
 
 from __future__ import annotations
@@ -70,11 +73,15 @@ _BRACKETS = re.compile(r"^\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")
 
 
 class Named(NamedTuple):
-    """Which column of a file holds a quantity; unit: where its name does not say; scale: such as -1 for the sign."""
+    """Which column of a file holds a quantity; unit: where its name does not say; scale: such as -1 for the sign.
+
+    value: in place of a column, the same in every row.
+    """
 
     column: str
     unit: str | None = None
     scale: float = 1.0
+    value: float | None = None
 
 
 @dataclass(frozen=True)
@@ -128,9 +135,8 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None) -> Measur
     names, raw, lines = _read_parquet(file) if file.suffix in (".parquet", ".pq") else _read_csv(file)
     found: dict[str, Array] = {}
     trouble: dict[str, str] = {}
-    asked = _asked(file, names, columns)
-    for quantity, (column, unit, scale) in asked.items():
-        values = raw[names.index(column)]
+    for quantity, (column, unit, scale, value) in _asked(file, names, columns, trouble).items():
+        values = raw[names.index(column)] if value is None else [value] * len(lines)
         array, message = _converted(quantity, column, unit, scale, values, lines)
         if array is None:
             trouble[quantity] = message
@@ -151,38 +157,41 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None) -> Measur
 
 
 def read_columns(table: Table) -> dict[str, Named]:
-    """The table ``columns`` of a manifest: quantity = "column", or { column, unit, scale }."""
+    """The table ``columns`` of a manifest: quantity = "column", { column, unit, scale }, or { value, unit }."""
     found = {}
     for quantity, entry in table.values.items():
         if isinstance(entry, str):
             found[quantity] = Named(entry)
             continue
         inner = table.table(quantity)
-        inner.only(["column", "unit", "scale"])
+        inner.only(["column", "unit", "scale", "value"])
         unit = inner.text("unit") if "unit" in inner.values else None
         if unit is not None and _unit(unit) is None:
             raise inner.error(f"unknown unit {unit!r}{nearest(unit, UNITS)}; known are {', '.join(UNITS)}", "unit")
-        found[quantity] = Named(inner.text("column"), unit, inner.number("scale", 1.0))
+        value = inner.number("value") if "value" in inner.values else None
+        column = inner.text("column") if value is None else quantity
+        found[quantity] = Named(column, unit, inner.number("scale", 1.0), value)
     return found
 
 
-def _asked(file: Path, names: Sequence[str], columns: Mapping[str, Named] | None) -> dict[str, Named]:
-    """For each quantity its column: as the mapping says, or all by their own names."""
+def _asked(
+    file: Path, names: Sequence[str], columns: Mapping[str, Named] | None, trouble: dict[str, str]
+) -> dict[str, Named]:
+    """For each quantity its column: as the mapping says, or all by their own names; two for one go to `trouble`."""
     if columns:
-        for quantity, named in columns.items():
-            if named.column not in names:
-                raise InputError(
-                    f"{file}: no column {named.column!r} for {quantity}{nearest(named.column, names)}; "
-                    f"there are {', '.join(names)}"
-                )
+        for quantity, (column, *_, value) in columns.items():
+            if value is None and (count := names.count(column)) != 1:
+                what = f"{count} columns are called" if count else "no column"
+                there = "" if count else f"{nearest(column, names)}; there are {', '.join(names)}"
+                raise InputError(f"{file}: {what} {column!r} for {quantity}{there}")
         return dict(columns)
     asked: dict[str, Named] = {}
     for name in names:
         quantity = _split(name)[0]
         if quantity in asked:
-            raise InputError(f"{file}: columns {asked[quantity].column!r} and {name!r} are both {quantity!r}")
-        asked[quantity] = Named(name)
-    return asked
+            trouble[quantity] = f"columns {asked[quantity].column!r} and {name!r} are both {quantity!r}"
+        asked.setdefault(quantity, Named(name))
+    return {quantity: named for quantity, named in asked.items() if quantity not in trouble}
 
 
 def _split(name: str) -> tuple[str, str | None]:

@@ -57,10 +57,10 @@ def key(name: str) -> str:
     return name if _BARE.fullmatch(name) else string(name)
 
 
-def with_keys(text: str, keys: Mapping[KeyPath, str], file: Path, without: Iterable[KeyPath] = ()) -> str:
-    """The text of the vehicle file `file` with the TOML values `keys` at these paths, and without these tables."""
+def with_keys(text: str, keys: Mapping[KeyPath, str], file: Path) -> str:
+    """The text of the vehicle file `file` with the TOML values `keys` at these paths."""
     new = {path: f"{key(path[-1])} = {value}\n" for path, value in keys.items()}
-    return spliced(text, new, {}, set(without), file)
+    return spliced(text, new, {}, set(), file)
 
 
 def _entries(text: str, file: Path) -> Iterable[_Entry]:

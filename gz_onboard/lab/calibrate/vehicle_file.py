@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,6 +25,8 @@ from gz_onboard.physics.model import BASE_EFFECTS
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
+_MADE_BY = re.compile("^# Made by: .*\n", re.MULTILINE)
+
 
 def vehicle_output(out: Path, inputs: Sequence[Path], option: str = "") -> None:
     """InputError if a vehicle file is not to be written as `out`. option: what stands before its name."""
@@ -37,14 +40,16 @@ def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> Vehicle:
     text = merged(base.read_text(encoding="utf-8"), results, base, out)
     if base.resolve().parent != out.resolve().parent:
         text = with_keys(text, copied_effects(read_vehicle(base).model.effects, out), out)
-    return write_whole(out, text)
+    return write_whole(out, text, "gz-onboard calibrate")
 
 
-def write_whole(out: Path, text: str) -> Vehicle:
-    """Write the vehicle file `out`, whole or not at all, and give it as read back.
+def write_whole(out: Path, text: str, maker: str) -> Vehicle:
+    """Write the vehicle file `out`, whole or not at all, its first line naming its `maker`, and give it as read back.
 
     Raises OSError, and InputError for a text that is no vehicle file: then what stood at `out` stays.
     """
+    if not text.startswith(head := f"# Made by: {maker}"):
+        text = f"{head}\n{_MADE_BY.sub('', text)}"
     temporary = out.with_name(out.name + ".new")
     temporary.write_text(text, encoding="utf-8", errors="replace")
     try:

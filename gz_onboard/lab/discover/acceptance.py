@@ -7,7 +7,7 @@ did widens the scatter, beside a common part that is free; and what was found on
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE_PREFIX, splits, unequal
-from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
+from gz_onboard.lab.discover.cross_validation import Fold, Squares, held_out, improves, squares, worsened
 from gz_onboard.lab.discover.linear import Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG_SCALED
@@ -25,6 +25,7 @@ from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_c
 ROUNDS = 25
 SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
 BEYOND = "would be beyond what it can be"
+WORSE = 0.1  # ln of a mean square on rides held out: so much is scatter
 MAX_REJECTIONS = 6  # names at most that are tried and refused
 
 
@@ -49,14 +50,23 @@ def within_bounds(mixed: MixedModel, cause: Candidate, change: Iterable[float], 
     return True
 
 
-def predicts_held_out(now: Selection, name: str) -> bool:
-    """Whether `name` beside the other causes chosen mends its own channels on rides held out of the fit."""
-    if len(now.lines) < 2:
-        return True
+def without_and_with(now: Selection, name: str) -> Iterator[Squares]:
+    """The mean squares of rides held out of the fit, without and with `name` beside the other causes chosen."""
     every = [now.search.causes[n] for n in now.chosen]
     others = [c for c in every if c.name != name]
-    held = held_out(now.mixed, now.lines, now.normals, Fold(every), Fold(others))
-    return improves(squares(held), now.search.shares.get(name, {}))
+    return squares(held_out(now.mixed, now.lines, now.normals, Fold(every), Fold(others)))
+
+
+def predicts_held_out(now: Selection, name: str) -> bool:
+    """Whether `name` beside the other causes chosen mends its own channels on rides held out of the fit."""
+    return len(now.lines) < 2 or improves(without_and_with(now, name), now.search.shares.get(name, {}))
+
+
+def carries_over(now: Selection, name: str) -> bool:
+    """Whether each channel that shows `name` is known at least as well with it as refitted, on rides held out."""
+    if len(now.lines) < 2:
+        return True
+    return all(more < WORSE for more in worsened(without_and_with(now, name), now.search.shares.get(name, {})).values())
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,8 @@ def rides_apart(learned: Learned) -> list[str]:
         i = max(judged, key=lambda i: abs(row[i] / sd[i]))
         if (far := abs(row[i] / sd[i])) > APART:
             found.append(
-                f"{line.ride.name} alone differs in {before.names[i]} by {far:.0f} times what rides do; is it healthy, "
-                "and are its signals right?"
+                f"{line.ride.name} is an outlier: {before.names[i]} is {far:.0f} times as far from the others as rides "
+                "usually are; is it healthy, and are its signals right?"
             )
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -12,10 +13,11 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
-from gz_onboard.lab.calibrate.toml_text import string, with_keys
+from gz_onboard.lab.calibrate.toml_text import KeyPath, string, with_keys
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, write_whole
 from gz_onboard.lab.discover.channels import ChannelNoise
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.vehicle import Vehicle
 
 
@@ -37,13 +39,26 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
         if "refitted on" in value.source
     }
     text = merged(base.read_text(encoding="utf-8"), [Result("baseline", parameters=found)], base, out)
+    keys = copied_effects(vehicle.model.effects, out) | saved_beside(mixed, out)
+    write_whole(out, with_keys(text, keys, out), f"gz-onboard discover --baseline, from {base.name}")
+
+
+def saved_beside(mixed: MixedModel, out: Path) -> dict[KeyPath, str]:
+    """Write what healthy rides taught beside the vehicle file `out`, and give the keys of it that name this."""
     beside = out.with_suffix(".healthy.npz")
     save(mixed, beside)
-    keys = copied_effects(vehicle.model.effects, out) | {
-        ("healthy", "file"): string(beside.name),
-        ("healthy", "rides"): str(mixed.healthy),
-    }
-    write_whole(out, with_keys(text, keys, out))
+    return {("healthy", "file"): string(beside.name), ("healthy", "rides"): str(mixed.healthy)}
+
+
+def accepted(mixed: MixedModel, found: Mapping[str, Found]) -> MixedModel:
+    """`mixed` of the vehicle after what was `found` of it: parameters that are known by their sd from there on."""
+    mean, prior = mixed.mean.copy(), mixed.prior.copy()
+    for name in set(found) & set(mixed.names):
+        (i,) = mixed.index([name])
+        value = found[name]
+        mean[i] = prior[i, :] = prior[:, i] = 0.0
+        prior[i, i] = (value.sd / (float(mixed.scale[i]) * (value.value if name in LOG_SCALED else 1.0))) ** 2
+    return replace(mixed, mean=mean, prior=prior, values=mixed.values | {n: f.value for n, f in found.items()})
 
 
 def save(mixed: MixedModel, file: Path) -> None:

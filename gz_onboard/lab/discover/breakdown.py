@@ -76,7 +76,7 @@ def outlying_rides(found: Discovery) -> list[str]:
         rows = [(abs(z), name, z) for name, z in zip(mixed.names, beyond, strict=True) if abs(z) > OUTSTANDING]
         if rows:
             most = ", ".join(f"{readable(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
-            sentences.append(f"{line.ride.name} alone differs by more than rides do: {most} standard deviations")
+            sentences.append(f"{line.ride.name} is an outlier: {most} standard deviations")
     return sentences
 
 

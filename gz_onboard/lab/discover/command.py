@@ -15,7 +15,7 @@ from gz_onboard.lab.discover.baseline import LEAST_RIDES, baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import loads_by_ride, outlying_rides
 from gz_onboard.lab.discover.candidates import candidates
-from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.extension import write_model
 from gz_onboard.lab.discover.mixed_model import MixedModel
@@ -131,7 +131,6 @@ def explain(
     report = found.report
     report.notes[:0] = left
     report.notes += [
-        *remaining_range_error(report),
         *loads_by_ride(found),
         *outlying_rides(found),
         *implausible_rides(found.lines),

@@ -62,6 +62,17 @@ def unequal(split: Split) -> bool:
     return abs(split.ratio) > RATIO and split.chi2 > CHI2
 
 
+def likeness(split: Split) -> str:
+    """Whether the halves are alike, in a word or two."""
+    return "differs" if unequal(split) else "alike" if abs(split.ratio) <= RATIO else "cannot tell"
+
+
+def varying(constancy: Sequence[Split], cause: str) -> str:
+    """In words, that a cause differs from ride to ride, and by how much where each was held against the others."""
+    ratios = [s.ratio for s in constancy if s.cause == cause and s.quantity.startswith(RIDE_PREFIX)]
+    return f"differs from ride to ride{f' ({min(ratios):+.2f} to {max(ratios):+.2f} of its mean)' if ratios else ''}"
+
+
 def splits(now: Selection) -> list[Split]:
     """Of each of the causes chosen, by every quantity of `SPLITS`, and each ride against the others."""
     found = []

@@ -87,18 +87,22 @@ def squares(held: Iterator[list[tuple[LinearRide, Array]]]) -> Iterator[Squares]
         yield {name: (before[name], control[name], after[name]) for name in before}
 
 
-def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
-    """Whether rides held out are known better after than before and than with the control, in the channels that have
-    a part of the evidence (`shares`), each by its share.
+def worsened(held: Iterator[Squares], shares: Mapping[str, float]) -> dict[str, float]:
+    """By how much rides held out are known worse after than before or with the control, whichever is better: ln of the
+    mean square, negative if better, of each channel that has a part of the evidence (`shares`).
     """
     rows = list(held)
-    total = 0.0
-    for channel, part in shares.items():
-        mine = [row[channel] for row in rows if channel in row]
-        if part > PART and mine:
+    found = {}
+    for channel in (name for name, part in shares.items() if part > PART):
+        if mine := [row[channel] for row in rows if channel in row]:
             before, control, after = (sum(column) for column in zip(*mine, strict=True))
-            total += part * float(np.log(after / min(before, control)))
-    return total < 0
+            found[channel] = float(np.log(after / min(before, control)))
+    return found
+
+
+def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
+    """Whether `worsened` is negative for all channels together, each by its share."""
+    return sum(shares[channel] * more for channel, more in worsened(held, shares).items()) < 0
 
 
 def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:

@@ -13,7 +13,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.baseline_file import restore
 from gz_onboard.lab.discover.blocks import usable
 from gz_onboard.lab.discover.channels import CHANNEL
-from gz_onboard.lab.discover.detectability import limits
+from gz_onboard.lab.discover.detectability import judge_remaining_error, limits
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.mixed_model import MixedModel, linearise_all
@@ -68,6 +68,7 @@ def discover(
     if report.unknown is not None and report.causes and not report.unknown.denies:
         plain = replace(discovery, report=replace(report, unknown=None))
         drop_curve(discovery, measure_gain(plain, seed, held))
+    judge_remaining_error(discovery)
     report.limits = limits(discovery)
     return discovery
 
@@ -83,7 +84,7 @@ def read_all(mixed: MixedModel, rides: Sequence[Samples]) -> tuple[list[Ride], l
             notes.append(str(error))
             continue
         if ride.distance < SHORTEST:
-            notes.append(f"ride {ride.name}: {ride.distance:.0f} m; less than {SHORTEST:.0f} m tell nothing")
+            notes.append(f"ride {ride.name}: {ride.distance:.0f} m; less than {SHORTEST:.0f} m are too short")
             continue
         found.append(ride)
     if not found:

@@ -12,6 +12,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.toml_text import number, string, with_keys
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, write_whole
+from gz_onboard.lab.discover.baseline_file import accepted, restore, saved_beside
 from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.result import CONSTANT, Unknown
 from gz_onboard.lab.discover.verdict import Discovery
@@ -39,9 +40,9 @@ LONGEST = 150  # characters of the rides' names, beyond which they are counted o
 def write_model(found: Discovery, vehicle: Vehicle, base: Path, out: Path) -> list[str]:
     """Write the vehicle extended by what was `found`, or by a curve for what has no name; what was done, in words.
 
-    The file is that of `base` with the added effects and parameters, their standard deviation from the interval; not
-    with the statistics of healthy rides, which were of the vehicle before. Effects that are not the package's are
-    copied into a folder beside it. The report's `extended_model` stays None if nothing could be added.
+    The file is that of `base` with the added effects and parameters, their standard deviation from the interval, and
+    what healthy rides taught, now about these. Effects that are not the package's are copied into a folder beside it.
+    The report's `extended_model` stays None if nothing could be added.
 
     What the vehicle file alone lacks is part of its ``[forecast] factor``, measured over modelled energy, and leaves
     it (`lowered`); what came on top of healthy rides is not.
@@ -76,7 +77,9 @@ def write_model(found: Discovery, vehicle: Vehicle, base: Path, out: Path) -> li
         keys |= {("forecast", "factor"): number(value), ("forecast", "source"): string(source)}
         words.append(f"forecast factor {vehicle.riding.factor:g} to {value:.3g}: what was found leaves it")
     text = merged(base.read_text(encoding="utf-8"), [Result("discover", parameters=parameters)], base, out)
-    write_whole(out, with_keys(text, keys, out, [("healthy",)]))
+    if vehicle.healthy is not None:
+        keys |= saved_beside(accepted(restore(vehicle), parameters), out)
+    write_whole(out, with_keys(text, keys, out), f"gz-onboard discover --write-model, from {base.name}")
     report.extended_model = str(out)
     return words
 

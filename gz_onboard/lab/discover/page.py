@@ -12,6 +12,7 @@ import numpy as np
 
 from gz_onboard.lab.discover.breakdown import before_and_after
 from gz_onboard.lab.discover.channels import CHANNEL
+from gz_onboard.lab.discover.constancy import likeness, varying
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
@@ -60,8 +61,8 @@ def body(found: Discovery, picture: Picture = lambda figure, _: _picture(figure)
         _head(found),
         _causes(report),
         _next(report),
-        "<h2>What the residuals are</h2>" + _residuals(report, before, after),
-        "<h2>Where they live</h2>",
+        "<h2>Residuals by channel</h2>" + _residuals(report, before, after),
+        "<h2>What residuals correlate with</h2>",
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
         picture(overview(stages, channels), "overview"),
     ]
@@ -72,11 +73,11 @@ def body(found: Discovery, picture: Picture = lambda figure, _: _picture(figure)
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{image}{note}</details>")
     parts += [
-        "<h2>Which cause</h2>" + picture(ranking(report), "ranking"),
-        "<h2>What it is worth: rides held out of the fit</h2>" + _gain(report),
+        "<h2>Candidates by score</h2>" + picture(ranking(report), "ranking"),
+        "<h2>Errors on held-out rides</h2>" + _gain(report),
     ]
     if report.unknown:
-        parts.append("<h2>What has no name</h2>" + picture(curve(report.unknown), "unknown"))
+        parts.append("<h2>Unexplained residual</h2>" + picture(curve(report.unknown), "unknown"))
     parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
     return "\n".join(parts)
 
@@ -109,7 +110,7 @@ def _head(found: Discovery) -> str:
     values, words = zip(*cards, strict=True)
     rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
     return (
-        f"<p>{VERDICTS[report.verdict].capitalize()}.</p>"
+        f"<p>{VERDICTS[report.verdict]}.</p>"
         f"<p>{rides}; against the vehicle as known from {known}.</p>{html_table(words, [values])}"
     )
 
@@ -124,14 +125,15 @@ def _causes(report: Report) -> str:
                 c.parameter,
                 with_unit(c.value, c.unit),
                 f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
-                f"{c.change:+.4g}",
+                with_unit(c.change, c.unit, "+.4g"),
                 f"{c.energy_share:+.1%}",
                 f"{c.evidence:.0f}",
             ]
         )
         for name, other in c.others.items():
             low, high = other.ci95
-            rows.append(["", name, f"{other.value:.4g}", f"{low:.4g} to {high:.4g}", "", "", ""])
+            value = with_unit(other.value, other.unit)
+            rows.append(["", name, value, f"{low:.4g} to {high:.4g}", "", "", ""])
     if rows:
         heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
         text += "<h2>Causes</h2>" + html_table(heads, rows, range(2, len(heads)))
@@ -141,18 +143,17 @@ def _causes(report: Report) -> str:
         )
     for c in report.causes:
         if c.varies:
-            name = readable(c.name)
-            text += f"<p>The {name} differs from ride to ride: it is named, but no model is extended with it.</p>"
+            text += f"<p>The {readable(c.name)} {varying(report.constancy, c.name)}: no model is extended with it.</p>"
     for group in report.ambiguous:
-        text += f"<p><b>Not told apart by these rides:</b> {', '.join(readable(name) for name in group)}.</p>"
+        text += f"<p><b>Ambiguous:</b> {', '.join(readable(name) for name in group)}.</p>"
     if report.unknown:
         u = report.unknown
         text += f"<p><b>No candidate explains</b> {in_words(u)}: {u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
         if u.denies:
             names = ", ".join(readable(name) for name in u.denies)
-            text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
+            text += f"<p><b>Rejected:</b> {names}, which would not act alike everywhere.</p>"
     for sentence in strain_words(report.strain) if report.strain else ():
-        text += f"<p><b>Cannot be:</b> {html.escape(sentence)}.</p>"
+        text += f"<p><b>Implausible:</b> {html.escape(sentence)}.</p>"
     return text
 
 
@@ -240,11 +241,11 @@ def _constancy(report: Report) -> str:
     splits = report.constancy
     if not splits:
         return ""
-    rows = [[readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}"] for s in splits]
+    rows = [[readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}", likeness(s)] for s in splits]
     return (
-        "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
-        "and lower half of a quantity, over the mean: 0 for the cause itself, ±1 for what acts in one half only.</p>"
-        + html_table(["cause", "over", "ratio", "chi-squared"], rows, (2, 3))
+        "<h2>Constancy of the causes</h2><p>Half the difference of left and right bends, or of the upper "
+        "and lower half of a quantity, or of a ride and the others, over the mean: 0 for the cause itself, ±1 for what "
+        "acts in one half only.</p>" + html_table(["cause", "over", "ratio", "chi-squared", "judged"], rows, (2, 3))
     )
 
 
@@ -258,7 +259,7 @@ def _limits(report: Report) -> str:
             rows.append([readable(name), limit.parameter, with_unit(limit.change, limit.unit, ".3g"), share])
     heads = ["cause", "parameter", "change", "of the energy"]
     return (
-        "<h2>What these rides could show</h2><p>The least change that would be found half the time, were it alone.</p>"
+        "<h2>Detection limits</h2><p>The least change that would be found half the time, were it alone.</p>"
         f"<details><summary>Every candidate</summary>{html_table(heads, rows, (2, 3))}"
         "</details>"
     )

@@ -11,10 +11,11 @@ from gz_onboard.offline.schema import OPTIONAL
 
 VERSION = 2  # of the keys: 1 had energy_per_way for consumption
 VERDICTS = {
-    "cause": "something differs from the model, and it has a name",
-    "none": "nothing is wrong that these rides could show",
-    "ambiguous": "something differs, and these rides cannot tell which of several",
-    "unknown": "something differs that is none of the candidates",
+    "cause": "Fault identified",
+    "none": "No fault found that these rides could show",
+    "ambiguous": "Fault found, but these rides cannot tell which of several causes it is",
+    "unknown": "Fault found that is none of the candidates",
+    "inconclusive": "The model misses rides held out by more than healthy rides, and no cause explains it",
 }
 METRICS = {
     "power": ("power, rms", 1.0, "W"),
@@ -35,14 +36,16 @@ class Estimate:
 
     value: float
     ci95: Interval
+    unit: str = "1"
 
 
 @dataclass(frozen=True)
 class Cause:
     """A cause that was named. value: of its first parameter once accepted; change: over the healthy one's.
 
-    evidence: chi-squared of one degree of freedom that leaving it out costs. varies: from ride to ride; what these
-    show promises nothing for the next, and no model is extended with it. parameters: all of them, the first first.
+    evidence: chi-squared of one degree of freedom that leaving it out costs. varies: from ride to ride, by itself or as
+    rides held out show; it promises nothing for the next ride, and no model is extended with it. parameters: all of
+    them, the first first.
     """
 
     name: str
@@ -57,7 +60,7 @@ class Cause:
     parameters: dict[str, Estimate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        first = {self.parameter: Estimate(self.value, self.ci95)}
+        first = {self.parameter: Estimate(self.value, self.ci95, self.unit)}
         object.__setattr__(self, "parameters", first | self.others)
 
     @property
@@ -208,8 +211,8 @@ class Split:
 class Limit:
     """The smallest change of a cause that these rides would show, half the time, were it alone.
 
-    change: of its first parameter [unit]; energy_share: as a magnitude, 0 for one that takes none. Both None if the
-    rides say nothing of it. needs: what shows it, each a set of roles.
+    change: of its first parameter [unit]; energy_share: as a magnitude, 0 for one that takes none. Both None if it is
+    not identifiable from the rides. needs: what shows it, each a set of roles.
     """
 
     parameter: str
@@ -224,12 +227,12 @@ class Report:
     """What was found."""
 
     version: int = field(default=VERSION, init=False)
-    verdict: Annotated[str, "cause, none, ambiguous or unknown"]
+    verdict: Annotated[str, "cause, none, ambiguous, unknown or inconclusive"]
     causes: Annotated[
         list[Cause],
         "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence (chi-squared of "
         "one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all of them: "
-        "value, ci95)",
+        "value, ci95, unit)",
     ]
     ambiguous: Annotated[list[list[str]], "sets of names that these rides cannot tell apart, the likeliest first"]
     unknown: Annotated[

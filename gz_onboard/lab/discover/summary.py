@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from gz_onboard.lab.discover.breakdown import before_and_after
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import CHANNEL
+from gz_onboard.lab.discover.constancy import varying
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Gain, Limit, Report
@@ -72,39 +73,43 @@ def _header(found: Discovery) -> list[str]:
 def _causes(report: Report) -> list[str]:
     lines = []
     for c in report.causes:
+        change = "" if c.change == c.value else f"; change {with_unit(c.change, c.unit, '+.4g')}"
         lines.append(
             f"  {c.name:20} {c.parameter} = {with_unit(c.value, c.unit)} "
-            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}), "
+            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}{change}), "
             f"{c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
         )
         for name, other in c.others.items():
             low, high = other.ci95
-            lines.append(f"  {'':20} {name} = {other.value:.4g} (95 %: {low:.4g} to {high:.4g})")
+            lines.append(f"  {'':20} {name} = {with_unit(other.value, other.unit)} (95 %: {low:.4g} to {high:.4g})")
         if c.varies:
-            lines.append(f"  {'':20} differs from ride to ride: named, but no model is extended with it")
+            lines.append(f"  {'':20} {varying(report.constancy, c.name)}: no model is extended with it")
     for group in report.ambiguous:
-        lines.append(f"  not told apart:      {', '.join(group)}")
+        lines.append(f"  ambiguous:           {', '.join(group)}")
     if report.unknown:
         u = report.unknown
-        lines.append(f"  no name:             {in_words(u)}, {u.share:+.1%} of the energy, score {u.score:.0f}")
+        lines.append(f"  unexplained:         {in_words(u)}, {u.share:+.1%} of the energy, score {u.score:.0f}")
         if u.denies:
-            lines.append(f"  denied:              {', '.join(u.denies)}, which would not act alike everywhere")
+            lines.append(f"  rejected:            {', '.join(u.denies)}, which would not act alike everywhere")
     return [
         *lines,
-        *(f"  cannot be:           {text}" for text in (strain_words(report.strain) if report.strain else ())),
+        *(f"  implausible:         {text}" for text in (strain_words(report.strain) if report.strain else ())),
     ]
 
 
 def _scores(found: Discovery) -> list[str]:
     report = found.report
-    best = ", ".join(f"{row.name} {row.score:.0f}" for row in report.ranking[:5])
+    named = {cause.name for cause in report.causes}.union(*report.ambiguous)
+    refused = (row.name for row in report.ranking if row.score > report.threshold and row.name not in named)
+    said = dict.fromkeys(refused, " (rejected)")
+    best = ", ".join(f"{row.name} {row.score:.1f}{said.get(row.name, '')}" for row in report.ranking[:5])
     left = residual_sizes(before_and_after(found)[0])
     largest = sorted(left.items(), key=lambda row: -abs(row[1].energy_share))[:ROWS]
     text = "; ".join(
         f"{readable(name)} {r.mean:+.3g} ± {r.rms:.3g} {CHANNEL[name].unit} ({r.energy_share:+.1%} of the energy)"
         for name, r in largest
     )
-    return [f"scores       {best}; healthy rides stay below {report.threshold:.0f}", f"residuals    {text}"]
+    return [f"scores       {best}; healthy rides stay below {report.threshold:.1f}", f"residuals    {text}"]
 
 
 def _limits(limits: Mapping[str, Limit]) -> list[str]:

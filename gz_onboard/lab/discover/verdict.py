@@ -10,7 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import brief
-from gz_onboard.lab.discover.acceptance import within_bounds
+from gz_onboard.lab.discover.acceptance import carries_over, within_bounds
 from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import CHANNELS, Channel
@@ -75,7 +75,7 @@ def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:
     unknown = unexplained(now, constancy, problem.limit)
     chosen = tuple(name for name in now.chosen if unknown is None or name not in unknown.denies)
     every = Search(now.mixed, now.search.evidence, problem.causes, problem.shares)
-    found = causes_of(now.search, chosen, now.lines)
+    found = [replace(c, varies=not carries_over(now, c.name)) for c in causes_of(now.search, chosen, now.lines)]
     sets = alternatives(now.search, chosen, problem.limit)
     scores = {name: every.part(chosen, name) for name in every.causes}
     notes = [*notes, *unseen(problem), *map(str, searched.rejected)]
@@ -114,14 +114,15 @@ def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], more: bool
 
 
 def unseen(problem: SearchProblem) -> list[str]:
-    """A note on the candidates that these rides say nothing of, and one on each that no ride has the sensors for."""
+    """A note on the candidates that are not identifiable, and one on each that no ride has the sensors for."""
     mixed = problem.mixed
     blind = [cause for cause in mixed.causes if cause not in problem.causes]
     there = {name for line in problem.lines for name in line.tables}
     lacking = [cause for cause in blind if not there & {c.name for c in showing(mixed, cause)}]
     notes = [f"{c.name} was not looked for: it needs {', or '.join(needs(mixed, c)) or 'a battery'}" for c in lacking]
     rest = [cause.name for cause in blind if cause not in lacking]
-    return [*(["these rides say nothing of " + ", ".join(rest)] if rest else []), *notes]
+    verb = "is" if len(rest) == 1 else "are"
+    return [*([f"{', '.join(rest)} {verb} not identifiable from these rides"] if rest else []), *notes]
 
 
 def showing(mixed: MixedModel, cause: Candidate) -> list[Channel]:
@@ -168,7 +169,7 @@ def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, 
         at = (float(x), float(x) - wide, float(x) + wide)
         ends = [stepped(parameter.name, healthy, step * y) for y in at]
         value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing that cannot be
-        rows[parameter.name] = Estimate(value, (low, high))
+        rows[parameter.name] = Estimate(value, (low, high), parameter.unit)
     return rows
 
 

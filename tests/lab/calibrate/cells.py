@@ -34,14 +34,14 @@ class Plant:
     state: list[float] = field(default_factory=list)
     reaction: float = 0.0  # ohm at 25 degC and no current: of charge transfer beside a double layer,
     activation: float = 4500.0  # K, of it
-    layer: float = 3.0  # s: resistance times the double layer's capacity
+    layer: float = 3.0  # s: resistance times the double layer's capacity; 0: none
     eta: float = 0.0  # V
 
     def charged(self, current, dt, temperature):
         """The double layer's voltage [V] after `dt` [s]: τ·η' = R·I - U·sinh(η/U), U = 2RT/F."""
         u = 1.7234e-4 * (temperature + 273.15)
         r = self.reaction * np.exp(self.activation * (1 / (temperature + 273.15) - 1 / 298.15))
-        if dt > 30:
+        if dt > 30 or not self.layer:
             self.eta = u * np.arcsinh(r * current / u)
             return self.eta
         n = int(np.ceil(dt / 0.05))

@@ -1,6 +1,7 @@
 """Charge transfer out of pulse tests: of a plant whose double layer is charged by a current that goes as sinh."""
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -51,3 +52,17 @@ def test_a_cell_without_it_has_none():
     assert not result.effects["charge_transfer"]
     assert not any(name.startswith("charge_transfer") for name in result.parameters)
     assert any("no resistance that falls with current" in note for note in result.notes)
+
+
+def test_it_may_take_all_of_r0():
+    levels = [(4.0, 10, 2.5), (0.0, 40, 5), (-1.0, 10, 2.5), (0.0, 40, 5), (1.0, 700, 25), (0.0, 1400, 50)]
+    cell = partial(Plant, r0=0.005, pairs=((0.005, 30.0),), cold=0.0, reaction=0.06, layer=0.0, activation=3200.0)
+    runs = enumerate((25.0, 40.0))
+    tests = [cell(seed=k).run([(0.0, 600, 100), *8 * levels], t, f"{t:g}.csv") for k, t in runs]
+    ocv, capacity = slow()
+    other = replace(ocv, value=ocv.value + 0.01 * np.sin(6 * ocv.axes["soc"]))  # of a cell that is much alike
+    result = pulse.calibrate(tests, other, capacity)
+    resistance = result.parameters["charge_transfer_resistance"]
+    assert abs(resistance.value - 0.06) < resistance.sd < 0.01
+    r0 = result.curves["battery.r0"].value
+    assert np.all((r0 > 0.004) & (r0 < 0.011))  # the cell's pair of 5 mΩ may be part of it

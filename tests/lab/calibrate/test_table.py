@@ -102,7 +102,8 @@ def test_the_mapping_of_a_manifest(tmp_path):
         ("time_s,current_A\n0,inf\n", ["current"], "'inf' is not a finite number"),
         ("time_s,current_A\n0,1\n2,1\n1,1\n", (), r"x.csv:4: time must not go back, but 1 s follows 2 s"),
         ("time_s,current_A\n0,1\n,1\n", (), "line 3, column 'time_s': '' is not a finite number"),
-        ("current_A,current_mA\n0,1\n", (), "'current_A' and 'current_mA' are both 'current'"),
+        ("current_A,current_mA\n0,1\n", ["current"], "'current_A' and 'current_mA' are both 'current'"),
+        ("time_s,Loop,time_ms,Loop\n0,1,0,2\n", (), "'time_s' and 'time_ms' are both 'time'"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, needed, message):
@@ -111,6 +112,29 @@ def test_what_is_wrong_is_named(tmp_path, text, needed, message):
         for quantity in needed:
             table[quantity]
     assert "x.csv" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["time_s\tnote\tvoltage_V\n0\ta,b\t4.1\n1\t\t4\n", "time_s;note;voltage_V\n0;a,b;4,1\n1;;4\n"]
+)
+def test_tabs_and_semicolons_separate_too(tmp_path, text):
+    table = read_table(write(tmp_path, text))
+    assert table["time"].tolist() == [0, 1] and table["voltage"].tolist() == [4.1, 4.0]
+
+
+def test_two_columns_of_one_name_may_be_there_if_none_asks_for_them(tmp_path):
+    file = write(tmp_path, "time_s,Loop,Loop,voltage_V\n0,1,2,4.1\n")
+    assert read_table(file)["voltage"].tolist() == [4.1]
+    assert read_table(file, {"time": Named("time_s"), "voltage": Named("voltage_V")})["voltage"].tolist() == [4.1]
+    with pytest.raises(InputError, match="2 columns are called 'Loop' for charge"):
+        read_table(file, {"charge": Named("Loop", "Ah")})
+
+
+def test_what_has_no_column_can_be_stated(tmp_path):
+    text = 'time = "time_s"\ncell_temperature = { value = 298.15, unit = "K" }\n'
+    columns = read_columns(Toml.read(write(tmp_path, text, "columns.toml")))
+    table = read_table(write(tmp_path, "time_s,Temp\n0,\n1,\n"), columns)
+    assert table["cell_temperature"].tolist() == [25, 25]
 
 
 @pytest.mark.parametrize("name", ["none.csv", "bad.csv.gz", "bad.parquet", "binary.csv"])

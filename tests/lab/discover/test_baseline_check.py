@@ -138,4 +138,4 @@ def test_a_ride_whose_sensor_lies_is_named(mixed: MixedModel):
     odd = ride(mixed, "road_force", "rolling_resistance_constant", 3 * rolling)
     lines = [*alike.lines[1:], replace(odd, ride=replace(odd.ride, name="ride_7"))]
     (said,) = rides_apart(replace(alike, lines=lines))
-    assert said.startswith("ride_7 alone differs in rolling_resistance_constant by ")
+    assert said.startswith("ride_7 is an outlier: rolling_resistance_constant is ")

@@ -12,6 +12,7 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
 from gz_onboard.lab.discover.baseline import adopted
 from gz_onboard.lab.discover.baseline_file import load, restore, write_baseline
 from gz_onboard.lab.discover.curve_forms import hat_functions
@@ -19,6 +20,7 @@ from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.extension import MODELLED, curve_text, write_model
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial, linearise_all
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.result import Cause, Estimate, Gain, Isolability, Report, Unknown
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
@@ -251,12 +253,38 @@ def test_once_more_gives_one_healthy_table(learned: MixedModel, tmp_path: Path):
     assert tomllib.loads(second.read_text())["healthy"] == {"file": "two.healthy.npz", "rides": 9}
 
 
-def test_the_extended_model_has_no_statistics_of_before(learned: MixedModel, lines, tmp_path: Path):
-    base, out = tmp_path / "base.toml", tmp_path / "new.toml"
+def test_the_extended_model_is_calibrated_about_what_was_found(learned: MixedModel, lines, tmp_path: Path):
+    """Also elsewhere: in a folder without the baseline's files."""
+    base, out = tmp_path / "base.toml", tmp_path / "there" / "new.toml"
+    out.parent.mkdir()
     write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, base)
-    vehicle = read_vehicle(str(base))
-    write_model(report(learned, lines, cornering()), vehicle, base, out)
-    assert read_vehicle(str(out)).healthy is None
+    growth = Cause("resistance_growth", "cell_resistance_factor", 1.4, "1", (1.2, 1.6), 0.4, 0.0, 70.0)
+    write_model(report(learned, lines, cornering(), growth), read_vehicle(str(base)), base, out)
+    before, after = restore(read_vehicle(str(base))), restore(read_vehicle(str(out)))
+    assert after.healthy == 7 and after.inflation == before.inflation and after.noise == before.noise
+    assert after.scatter == pytest.approx(before.scatter)
+    now = after.values_at(after.mean)
+    sd = np.sqrt(np.diag(after.prior)) * after.scale
+    for cause in (cornering(), growth):
+        name = cause.parameter
+        (i,) = after.index([name])
+        assert now[name] == pytest.approx(cause.value) == pytest.approx(after.healthy_value(name))
+        wide = (cause.ci95[1] - cause.ci95[0]) / 2 / learned.quantile
+        assert sd[i] * (cause.value if name in LOG_SCALED else 1.0) == pytest.approx(wide)
+        assert np.count_nonzero(after.prior[i]) == 1
+    kept = [n for n in before.names if n not in ("cornering_compliance", "cell_resistance_factor")]
+    assert after.mean[after.index(kept)] == pytest.approx(before.mean[before.index(kept)])
+
+
+def test_the_first_line_names_what_made_the_file(learned: MixedModel, lines, tmp_path: Path):
+    base, out, last = (tmp_path / f"{name}.toml" for name in ("base", "new", "last"))
+    write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, base)
+    write_model(report(learned, lines, cornering()), read_vehicle(str(base)), base, out)
+    write_vehicle(out, [], last)
+    for file, maker in ((base, "discover --baseline"), (out, "discover --write-model"), (last, "calibrate")):
+        lines_of = file.read_text().splitlines()
+        assert lines_of[0].startswith(f"# Made by: gz-onboard {maker}")
+        assert sum("Made by" in line for line in lines_of) == 1
 
 
 def test_statistics_that_cannot_be_read_are_refused(learned: MixedModel, mixed: MixedModel, tmp_path: Path):

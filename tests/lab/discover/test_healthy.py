@@ -6,15 +6,18 @@ The share of false alarms over a hundred sets is measured by ``python -m benchma
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
 from benchmarks.trial import LACKS, MARK, Row, alarm, discovered, healthy_document, reported, with_section
+from gz_onboard.lab.discover import acceptance
 from gz_onboard.lab.discover.acceptance import with_observed_scatter, within_bounds
 from gz_onboard.lab.discover.baseline import baseline
-from gz_onboard.lab.discover.cross_validation import improves
+from gz_onboard.lab.discover.cross_validation import improves, worsened
 from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.curves import supported_knots
 from gz_onboard.lab.discover.discovery import discover
@@ -22,6 +25,7 @@ from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.search import one_degree
+from gz_onboard.lab.discover.selection import Selection
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests import plant
@@ -129,6 +133,23 @@ def test_a_cause_must_foretell_its_own_channel():
     assert not improves(iter([refit_alone_is_worse]), shares)
 
 
+def test_a_cause_that_a_refit_beats_in_one_of_its_channels_does_not_carry_over(monkeypatch: pytest.MonkeyPatch):
+    """On the whole it foretells rides held out: the voltage's steps are better, the voltage itself is worse."""
+    rows = [
+        {"voltage_timing": (4.0, 4.0, 1.0), "cell_voltage": (3.0, 1.5, voltage), "gps_speed": (1.0, 1.0, 9.0)}
+        for voltage in (1.0, 3.5)
+    ]
+    shares = {"voltage_timing": 0.8, "cell_voltage": 0.19, "gps_speed": 0.01}
+    assert improves(iter(rows), shares)
+    assert worsened(iter(rows), shares) == pytest.approx(
+        {"voltage_timing": np.log(1 / 4), "cell_voltage": np.log(4.5 / 3)}
+    )
+    monkeypatch.setattr(acceptance, "without_and_with", lambda now, name: iter(now.rows))
+    for ridden, expected in ((rows, False), (rows[:1], True)):
+        now = SimpleNamespace(lines=[1, 2], rows=ridden, search=SimpleNamespace(shares={"resistance_growth": shares}))
+        assert acceptance.carries_over(cast(Selection, now), "resistance_growth") is expected
+
+
 def test_the_fewer_the_healthy_rides_the_less_a_curve_of_many_coefficients_says():
     for freedom in (8.0, 22.0, 200.0):
         assert one_degree(30.0, 1, freedom) == pytest.approx(30.0)  # F(1, n) is the square of Student's t
@@ -165,6 +186,7 @@ def test_alarms_are_counted_as_they_are():
     assert not alarm(row("file", ["cornering_drag"]))
     assert alarm(row("file", ["cornering_drag", "ocv_hysteresis"]))
     assert alarm(row("baseline", [], curve))
+    assert alarm(row("baseline", []) | {"verdict": "inconclusive"})
     text = healthy_document([row("baseline", []), row("baseline", ["headwind"]), row("file", [])], 7, "abc")
     assert "| baseline of eight rides | 1 of 2, 50 %" in text
     assert "| the vehicle file alone | 0 of 1, 0 %" in text

@@ -10,7 +10,9 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.trial import Row, discovered, interval, judge, reported, right, summary
+from gz_onboard.lab.discover import verdict
 from gz_onboard.lab.discover.baseline import baseline
+from gz_onboard.lab.discover.result import VERDICTS
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant import cases as plant
@@ -41,7 +43,7 @@ def rows(base: Vehicle, ridden: Ridden) -> list[Row]:
 
 def test_every_case_is_judged(rows):
     assert [row["seed"] for row in rows] == list(range(FIRST, FIRST + CASES))
-    assert {row["verdict"] for row in rows} <= {"cause", "none", "ambiguous", "unknown"}
+    assert {row["verdict"] for row in rows} <= set(VERDICTS)
     assert {row["kind"] for row in rows} > {"healthy", "one"}  # else the seeds would test too little
 
 
@@ -78,6 +80,25 @@ def test_windy_days_are_named_but_no_model_is_extended_with_them(base):
     assert any("from ride to ride" in note for note in report["notes"])
     for metric in ("power", "consumption", "range"):
         assert report["gain"][metric]["after"] == report["gain"][metric]["control"]
+
+
+def test_what_does_not_carry_over_is_named_and_counts_for_no_gain(base, ridden, monkeypatch):
+    (case, *_) = (case for case in ridden[1] if case.kind == "one" and case.truths[0].clear)
+    assert not any(cause["varies"] for cause in discovered(base, case.rides)["causes"])
+    monkeypatch.setattr(verdict, "carries_over", lambda *_: False)
+    report = discovered(base, case.rides)
+    assert report["causes"] and all(cause["varies"] for cause in report["causes"])
+    errors = [metric for metric in report["gain"].values() if isinstance(metric, dict)]
+    assert errors and all(metric["after"] == metric["control"] for metric in errors)
+
+
+def test_winds_that_hardly_show_leave_it_inconclusive(base):
+    """Too few rides for a name, and yet their energy is missed by more than that of healthy ones."""
+    report = discovered(base, plant.windy(FIRST + 9, 3.5)[:2])
+    assert (report["verdict"], report["causes"], report["unknown"]) == ("inconclusive", [], None)
+    assert report["gain"]["range"]["after"] > 0.08
+    assert any("is missed on rides held out" in note for note in report["notes"])
+    assert any("there and back" in line for line in report["advice"])
 
 
 def test_a_cause_counts_from_what_healthy_rides_taught(base):

@@ -21,13 +21,20 @@ from gz_onboard.lab.discover.breakdown import (
     share_over,
 )
 from gz_onboard.lab.discover.channels import CHANNEL
-from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.constancy import likeness
+from gz_onboard.lab.discover.detectability import (
+    HEALTHY_MOST,
+    implausible_rides,
+    judge_remaining_error,
+    limits,
+    missing_residuals,
+)
 from gz_onboard.lab.discover.gain import summarised
 from gz_onboard.lab.discover.grid import since_change
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.page import body, write_report
-from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Unknown
+from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Split, Unknown
 from gz_onboard.lab.discover.summary import summary
 from gz_onboard.lab.discover.uncalibrated import prior_of_file
 from gz_onboard.lab.discover.verdict import Discovery
@@ -152,7 +159,7 @@ def test_the_page_says_it_all(found: Discovery, tmp_path: Path):
         "Ride &lt;more&gt;.",
         "a note",
         "a&lt;b",
-        "What has no name",
+        "Unexplained residual",
         "+0.5 to +1.5",
         "dragging brake",
     )
@@ -180,12 +187,42 @@ def test_a_ride_of_another_vehicle_is_suspected(found: Discovery):
     assert "coastdown: GPS speed is 1.3" in said
 
 
-def test_a_range_that_is_still_missed_is_said(found: Discovery):
-    errors = Errors(0.2, 0.1, 0.09, (0.0, 0.02))
-    (said,) = remaining_range_error(replace(found.report, gain=Gain(range=errors)))
-    assert "9% of the range is missed" in said
-    assert remaining_range_error(replace(found.report, gain=Gain(range=replace(errors, after=0.02)))) == []
-    assert remaining_range_error(replace(found.report, gain=Gain(note="one ride: nothing to hold out"))) == []
+def missed(share: float, drawn: float | None = None) -> Gain:
+    """Of the range; or of the energy, with what was drawn a metre [J/m], where the range is not known."""
+    errors = Errors(0.2, 0.1, share * (drawn or 1.0), (0.0, 0.02))
+    return Gain(consumption=errors) if drawn else Gain(range=errors)
+
+
+@pytest.mark.parametrize("of_range", [True, False])
+def test_what_is_missed_on_rides_held_out_is_judged(found: Discovery, of_range: bool):
+    (line,) = found.lines
+    drawn = None if of_range else line.ride.energy / line.ride.distance
+
+    def judged(gain: Gain, verdict: str = "none") -> Report:
+        report = replace(found.report, gain=gain, notes=[], advice=[], causes=[], verdict=verdict)
+        judge_remaining_error(replace(found, report=report))
+        return report
+
+    assert judged(Gain(note="one ride: nothing to hold out")).verdict == "none"
+    small, some, much = (missed(share, drawn) for share in (0.02, HEALTHY_MOST - 0.001, HEALTHY_MOST + 0.011))
+    assert (judged(small).verdict, judged(small).notes) == ("none", [])
+    assert (judged(some).verdict, len(judged(some).notes)) == ("none", 1)
+    assert judged(much).verdict == "inconclusive" and judged(much).advice
+    assert f"9% of the {'range' if of_range else 'energy'} is missed" in judged(much).notes[0]
+    assert judged(much, "unknown").verdict == "unknown" and judged(much, "unknown").notes
+
+
+def test_a_change_has_its_unit_and_what_differs_from_ride_to_ride_is_said(found: Discovery):
+    load = Cause("auxiliary_load", "auxiliary_power", 58.7, "W", (57.0, 60.0), 15.1, 0.02, 99.0, varies=True)
+    ratios = {"ride a": (-0.93, 5.6), "ride b": (0.6, 2.1), "ride c": (0.5, 1.6), "time": (0.9, 12.0)}
+    splits = [Split("auxiliary_load", name, *row) for name, row in ratios.items()]
+    ranking = [Score("capacity_fade", 74.8), Score("auxiliary_load", 99.0), Score("headwind", 14.96)]
+    report = replace(found.report, causes=[load], constancy=splits, ranking=ranking, threshold=15.0)
+    text, page = (summary(replace(found, report=report)), body(replace(found, report=report), unseen))
+    assert "change +15.1 W" in text and "+15.1 W" in page
+    assert all("differs from ride to ride (-0.93 to +0.60 of its mean)" in said for said in (text, page))
+    assert "capacity_fade 74.8 (rejected), auxiliary_load 99.0, headwind 15.0;" in text
+    assert [likeness(split) for split in splits] == ["cannot tell", "cannot tell", "alike", "differs"]
 
 
 def test_one_ride_held_out_has_no_interval(found: Discovery):
@@ -205,7 +242,7 @@ def test_what_one_ride_alone_shows_is_said(found: Discovery):
     far[mixed.names.index("soc_start")] = 12.0
     lines = [line.seen_from(far) for line in found.lines]
     (said,) = outlying_rides(replace(found, lines=lines, normals=[normal(line, mixed.noise) for line in lines]))
-    assert "coastdown alone differs" in said
+    assert "coastdown is an outlier" in said
     assert "soc start +1" in said
 
 

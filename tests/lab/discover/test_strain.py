@@ -67,10 +67,10 @@ def test_what_the_refit_took_is_not_nothing(wrong: Discovery):
     most = report.strain.refitted[0]
     assert most.parameter == "torque_constant" and most.value > 2 * most.known and not most.stated
     text = " ".join(summary(wrong).split())
-    assert "nothing is wrong" not in text
+    assert "No fault" not in text
     assert "in the refit, which is implausible: torque_constant 0.4523 to 1." in text
     assert "Give what the file does not say (torque_constant)." in text and "cannot tell which is wrong" in text
-    assert "Cannot be:" in body(wrong, lambda figure, _: "")
+    assert "Implausible:" in body(wrong, lambda figure, _: "")
 
 
 def test_a_score_far_beyond_the_threshold_is_not_nothing_even_if_its_cause_cannot_be(wrong: Discovery):
