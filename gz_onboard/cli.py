@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
     "vehicle": ("gz_onboard.lab.vehicle.command", "begin a vehicle file, or check whether it fits the vehicle's logs"),
-    "report": ("gz_onboard.lab.report", "show recorded rides as one HTML page that fetches nothing, also on a phone"),
+    "report": ("gz_onboard.lab.report", "show recorded rides as one self-contained HTML page, also for phones"),
     "history": ("gz_onboard.lab.history.command", "keep the rides of months in a file, and show what they come to"),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }

@@ -194,6 +194,11 @@ class Reason(IntFlag):
 
 KEEPING = Reason.LOG_FAILED | Reason.SAVE_FAILED
 """Of what is kept of a ride: no range is less certain for them."""
+NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
+OF_RIDING = Reason.NO_SPEED | Reason.NO_IMU | Reason.NO_GPS | Reason.NO_INVERTER_CURRENT
+"""Sensors that sleep on many vehicles while they are charged, and are not missed then."""
+NO_SENSOR = NO_PACK | OF_RIDING | Reason.NO_CELL_TEMPERATURE | Reason.NO_AMBIENT_TEMPERATURE
+"""Reasons that name a sensor without data."""
 
 
 TOLD = 50.0  # m: RANGE_Why counts tenths of a kilometre
@@ -234,11 +239,12 @@ class Explanation:
 
 
 _WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}
+_PHRASES = {"prior_riding": "less than 3 km ridden"}
 
 
 def words(name: str) -> str:
     """The name of a reason, a role or an effect in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
-    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
+    return _PHRASES.get(name.lower()) or " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
 
 
 _CAUSE_WORDS = {

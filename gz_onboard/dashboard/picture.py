@@ -17,22 +17,12 @@ from gz_onboard.events import Activity, Reason, RouteState, State
 VERSION = 1
 NO_LONGER_EMPTY = NEARLY_EMPTY + 2.0  # %: an alert that stands goes only here, not at each wobble
 NO_LONGER = 2.0  # K, of a cell that was too hot or too cold: likewise
-SENSOR_LOST = (
-    Reason.NO_PACK_VOLTAGE
-    | Reason.NO_PACK_CURRENT
-    | Reason.NO_INVERTER_CURRENT
-    | Reason.NO_CELL_TEMPERATURE
-    | Reason.NO_SPEED
-    | Reason.NO_IMU
-    | Reason.NO_GPS
-    | Reason.NO_AMBIENT_TEMPERATURE
-    | Reason.SENSOR_DISTRUSTED
-)
 
 # Alerts, the most urgent first.
 BUS_DOWN = "bus_down"
 SILENT = "silent"
 PARTLY_SILENT = "partly_silent"
+WAITING = "waiting"
 RANGE_INVALID = "range_invalid"
 UNREACHABLE = "destination_unreachable"
 BATTERY_LOW = "battery_nearly_empty"
@@ -40,7 +30,19 @@ UNCERTAIN = "destination_uncertain"
 SENSORS = "sensor_lost"
 HOT = "cell_too_hot"
 COLD = "cell_too_cold"
-ALERTS = (BUS_DOWN, SILENT, PARTLY_SILENT, RANGE_INVALID, HOT, UNREACHABLE, BATTERY_LOW, COLD, UNCERTAIN, SENSORS)
+ALERTS = (
+    BUS_DOWN,
+    SILENT,
+    PARTLY_SILENT,
+    WAITING,
+    RANGE_INVALID,
+    HOT,
+    UNREACHABLE,
+    BATTERY_LOW,
+    COLD,
+    UNCERTAIN,
+    SENSORS,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +128,10 @@ class Picture:
     state: str | None
     activity: str | None
     range: Range
+    range_10min_km: tuple[float | None, ...]  # one each 10 s, the oldest first
     battery: BatteryLevel
     cells: Cells | None
+    speed_km_h: float | None
     odometer_km: float | None
     ridden_today_km: float | None
     consumption: Consumption
@@ -136,6 +140,7 @@ class Picture:
     rated_km: float | None
     causes: tuple[CauseOfRange, ...]
     reasons: tuple[str, ...]
+    lost: tuple[str, ...]  # of the reasons: sensors that came before
     distrusted: tuple[str, ...]
     late: tuple[str, ...]  # messages, and roles of the vehicle's, of which a newer one should have come
     stale: tuple[str, ...]  # messages whose numbers are no longer given
@@ -160,7 +165,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     battery = BatteryLevel(
         *(_rounded(value(f"RANGE_{name}")) for name in ("StateOfCharge", "StateOfChargeSigma", "EnergyLeft"))
     )
-    route, reasons = _route(view, now), view.reasons(now)
+    route, reasons, lost, waiting = _route(view, now), view.reasons(now), view.lost(now), view.waiting(now)
     stale = tuple(view.stale(now))
     charging = activity is Activity.CHARGING
     distrusted, vehicle = tuple(view.distrusted(now)), view.vehicle
@@ -171,9 +176,10 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         SILENT: len(stale) == len(view.messages),
         # Not of one that never came: the first frames may have only just begun.
         PARTLY_SILENT: len(stale) < len(view.messages) and any(view.messages[name].received for name in stale),
-        RANGE_INVALID: state is State.INVALID,
+        WAITING: waiting,
+        RANGE_INVALID: state is State.INVALID and not waiting,
         BATTERY_LOW: not charging and _low(battery.soc_percent, BATTERY_LOW in before),
-        SENSORS: any(reason & SENSOR_LOST for reason in reasons),
+        SENSORS: Reason.SENSOR_DISTRUSTED in reasons or (bool(lost) and not waiting),
         **_of_cells(cells, vehicle.limits(charging) if vehicle else None, before),
         **_of_destination(route),
     }
@@ -186,8 +192,10 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         state=_name(state),
         activity=_name(activity),
         range=Range(*(_rounded(value(f"RANGE_Remaining{part}")) for part in ("", "P10", "P90"))),
+        range_10min_km=tuple(map(_rounded, view.trend(now))),
         battery=battery,
         cells=Cells(*(round(value, 1) for value in cells)) if cells else None,
+        speed_km_h=vehicle.speed(now, distrusted) if vehicle else None,
         odometer_km=None if odometer is None else round(odometer, 1),
         ridden_today_km=None if ridden is None else round(ridden, 1),
         consumption=Consumption(
@@ -198,6 +206,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         rated_km=_rounded(value("RANGE_WhyRated")),
         causes=tuple(CauseOfRange(cause.name.lower(), round(km, 3)) for cause, km in view.why(now)),
         reasons=tuple(str(reason.name).lower() for reason in reasons),
+        lost=tuple(str(reason.name).lower() for reason in lost),
         distrusted=distrusted,
         late=(
             *(name for name, entry in view.messages.items() if entry.late(now)),

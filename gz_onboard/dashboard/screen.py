@@ -9,7 +9,7 @@ from functools import partial
 
 from gz_onboard.bus.publisher import reason_signal
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import KEEPING, State, cause_words, words
+from gz_onboard.events import KEEPING, NO_SENSOR, Reason, State, cause_words, words
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,11 @@ _STATE_COLOURS = {State.STARTING: "36", State.VALID: "32", State.DEGRADED: "33",
 _STATE_WORDS = {
     State.STARTING: "starting: no estimate yet",
     State.VALID: "valid",
-    State.DEGRADED: "degraded: an input is missing or doubtful, interval wider",
-    State.INVALID: "invalid: no range can be told",
+    State.DEGRADED: "degraded: an input is missing or doubtful, wider interval",
+    State.INVALID: "invalid: range unavailable",
 }
 
+_WAITING = "waiting for the scooter"
 _NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"
 
 Span = tuple[str, str]
@@ -55,7 +56,7 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         colour = _DIM
     interval = number("RANGE_RemainingP10"), (" to ", _DIM), number("RANGE_RemainingP90")
     recent = number("RANGE_ConsumptionRecent"), (" over the last km", "")
-    trust = (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM)
+    trust = (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("unknown", _DIM)
     lines: list[Line] = [
         [(" gz-onboard", _BOLD), (f" · {source}", _DIM)],
         [],
@@ -67,16 +68,16 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         _row("Consumption", number("RANGE_ConsumptionExpected"), (" expected, ", ""), *recent),
         *_why(view, now),
         [],
-        _row("State", trust),
+        _row("State", (_WAITING, _BOLD) if view.waiting(now) else trust),
     ]
     if activity := view.activity(now):
         lines.append(_row("Activity", (activity, "")))
     if charge := view.charge(now):
         lines.append(_row("Charge", (charge, "")))
     last = ""
-    for reason in sorted(view.reasons(now), key=KEEPING.__contains__):
+    for reason in sorted(_reasons(view, now), key=KEEPING.__contains__):
         name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
-        label = "Note" if reason in KEEPING else "Less certain" if state is State.VALID else "Because"
+        label = "Note" if reason in KEEPING else "Wider interval" if state is State.VALID else "Because"
         lines.append(_row("" if label == last else label, (name, "33")))
         last = label
         if len(name) + len(comment) + 24 <= width:
@@ -113,10 +114,16 @@ def causes_text(view: View, now: float) -> str:
     return ", ".join(f"{cause_words(cause.name)} {size:+.1f} km" for cause, size in view.why(now))
 
 
+def _reasons(view: View, now: float) -> list[Reason]:
+    """The reasons that are shown; without the scooter it goes without saying that its sensors are silent."""
+    hidden = NO_SENSOR if view.waiting(now) else Reason(0)
+    return [reason for reason in view.reasons(now) if reason not in hidden]
+
+
 def _because(state: State | None) -> str:
     """What reasons are said to be the cause of: they leave a valid estimate valid."""
     known = "" if state is None else f"{state.name.lower()} "
-    return "less certain because" if state is State.VALID else f"{known}because"
+    return "wider interval" if state is State.VALID else f"{known}because"
 
 
 def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
@@ -210,7 +217,7 @@ def summary_line(view: View, now: float) -> str:
         f"SOC {text('RANGE_StateOfCharge')} ± {text('RANGE_StateOfChargeSigma')}",
         f"{text('RANGE_EnergyLeft')} left",
         f"{text('RANGE_ConsumptionRecent')} recent, {text('RANGE_ConsumptionExpected')} expected",
-        state.name.lower() if state is not None else "state not known",
+        _WAITING if view.waiting(now) else state.name.lower() if state is not None else "state unknown",
     ]
     if activity := view.activity(now):
         parts.append(activity)
@@ -219,8 +226,8 @@ def summary_line(view: View, now: float) -> str:
     if causes := causes_text(view, now):
         parts.append(f"why, besides charge: {causes}")
     for what, names in (
-        (_because(state), [words(str(reason.name)) for reason in view.reasons(now) if reason not in KEEPING]),
-        ("note", [words(str(reason.name)) for reason in view.reasons(now) if reason in KEEPING]),
+        (_because(state), [words(str(reason.name)) for reason in _reasons(view, now) if reason not in KEEPING]),
+        ("note", [words(str(reason.name)) for reason in _reasons(view, now) if reason in KEEPING]),
         ("left out", [words(role) for role in view.distrusted(now)]),
         ("stale", list(view.stale(now))),
     ):

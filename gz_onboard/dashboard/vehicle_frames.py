@@ -1,6 +1,6 @@
-"""What the page shows of the vehicle's own frames: how warm its cells are, and how far it was ridden today.
+"""The vehicle's own frames on the page: its speed, how warm its cells are, and how far it was ridden today.
 
-The range frames say neither. The frames are read by the vehicle's DBC files, as the daemon reads them.
+The range frames have none of these. The frames are read by the vehicle's DBC files, as the daemon reads them.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Container
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -18,6 +19,7 @@ from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.estimator.signals import LEAPS, Told
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating
+from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
 CELLS = "cell_temperature"
@@ -26,6 +28,7 @@ ODOMETER = "odometer"
 SHOWN = CELLS, COLDEST, HOTTEST, ODOMETER
 LATE_PERIODS = 3
 PERIOD = 1.0  # s, where nothing says it
+SHORTEST = 0.1  # s: the bus is read every twentieth of a second, however often a message comes
 RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the vehicle file says nothing
 CHARGING = 0.0, 45.0  # degC: likewise
 MOST_OF_A_DAY = 86_400 * LEAPS[ODOMETER][2]  # m
@@ -41,8 +44,12 @@ class VehicleFrames:
 
     def __init__(self, vehicle: Vehicle, kept: Path | None = None) -> None:
         mapping = vehicle.mapping
+        p = vehicle.parameters
+        factors = speed_factors(p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"])
+        roles = {source.role for source in mapping.sources}
+        self._speed = next(((role, factor) for role, factor in factors.items() if role in roles), ("", 0.0))
         chosen, of_instruments = (
-            tuple(source for source in sources if source.role in SHOWN)
+            tuple(source for source in sources if source.role in (*SHOWN, self._speed[0]))
             for sources in (mapping.sources, mapping.instruments)
         )
         # That it is this vehicle's bus is believed where its checksum is right, if it has such, and not by chance.
@@ -53,7 +60,8 @@ class VehicleFrames:
         self.identifiers = identifiers_of(mapping, {source.message for source in (*chosen, *of_instruments)})
         self._limits = cell_limits(vehicle.derating)
         self._codec = Codec(replace(mapping, sources=chosen + of_instruments))
-        self._period = {role: group.period or PERIOD for group in self._codec.groups for role in group.roles}
+        periods = {role: group.period or PERIOD for group in self._codec.groups for role in group.roles}
+        self._period = {role: max(period, SHORTEST) for role, period in periods.items()}
         self._last: dict[str, tuple[float, float]] = {}  # by role: value, time
         self._day = Day(kept, vehicle.name)
 
@@ -85,6 +93,12 @@ class VehicleFrames:
         """The coldest and the warmest cell [degC]; None if nothing says it."""
         known = [value for role in (COLDEST, CELLS, HOTTEST) if (value := self.value(role, now)) is not None]
         return (min(known), max(known)) if known else None
+
+    def speed(self, now: float, distrusted: Container[str]) -> float | None:
+        """[km/h], whole, as speedometers show it; None if nothing says it, or only a sensor that is `distrusted`."""
+        role, factor = self._speed
+        value = None if role in distrusted else self.value(role, now)
+        return None if value is None else round(abs(value * factor) * 3.6)
 
     def odometer(self, now: float) -> tuple[float | None, float | None]:
         """What it shows, and what was ridden since the day began, or since the start if nothing was kept [km]."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal, sensor_signal
-from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Cause, Frame, Reason, State
+from gz_onboard.events import NO_PACK, NO_SENSOR, OF_RIDING, ROLES, STALE_PERIODS, Activity, Cause, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 LATE_PERIODS = 3  # after so many the numbers are shown in grey, after STALE_PERIODS not at all
 NEARLY_EMPTY = 15.0  # %: a state of charge that the rider is told of
+TREND_STEP, TREND_STEPS = 10.0, 60  # s between the ranges of the last ten minutes, and their number
 PERIODS = {"RANGE_Status": 100}  # ms, where the DBC does not say; of the others 1000
 _NUMBERS = {  # how each is written: format, unit
     "RANGE_Remaining": (".1f", "km"),
@@ -77,6 +78,8 @@ class View:
             limits = {s.name: raw_range(s, not_available=True) for s in message.signals}
             self.messages[name] = Received(message, (message.cycle_time or PERIODS.get(name, 1000)) / 1000, limits)
         self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent().items()}
+        self._came = Reason(0)  # by their reasons, the sensors that have been there since the daemon started
+        self._ranges: dict[int, float | None] = {}  # km, by the number of the step of `TREND_STEP`
 
     @property
     def identifiers(self) -> list[int] | None:
@@ -112,6 +115,20 @@ class View:
             low, high = entry.limits[signal.name]
             scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
             entry.values[signal.name] = value * scale + offset if low <= value <= high else None
+        if message.name == "RANGE_Estimate":
+            step = int(now // TREND_STEP)
+            kept = {i: km for i, km in self._ranges.items() if i > step - TREND_STEPS}
+            self._ranges = kept | {step: entry.values["RANGE_Remaining"]}
+        elif message.name == "RANGE_Status":
+            self._note_sensors(now)
+
+    def _note_sensors(self, now: float) -> None:
+        """Note which sensors are there: only one that has been can be lost."""
+        working = ~sum(self.reasons(now), Reason(0))
+        if self.activity(now) == "charging":
+            working &= ~OF_RIDING  # their absence is not reported then
+        starting = self._state("RANGE_StatusState", now) == State.STARTING
+        self._came = working if starting else self._came | working
 
     def value(self, signal: str, now: float) -> float | None:
         """A signal's value in the units of the DBC; None if it is stale, not available or never came.
@@ -151,6 +168,27 @@ class View:
     def reasons(self, now: float) -> list[Reason]:
         """Why the estimate is not what it could be."""
         return [reason for reason in Reason if self.value(reason_signal(reason), now)]
+
+    def lost(self, now: float) -> list[Reason]:
+        """The sensors from which nothing comes any more; one that never came is missing, not lost."""
+        return [reason for reason in self.reasons(now) if reason & NO_SENSOR & self._came]
+
+    def waiting(self, now: float) -> bool:
+        """Whether there is no estimate because the scooter is not on yet, or has gone to sleep."""
+        if self.state(now) not in (State.STARTING, State.INVALID):
+            return False
+        pack, activity = sum(self.reasons(now), Reason(0)) & NO_PACK, self.activity(now)
+        return bool(pack) and (activity == "asleep" or (not activity and not pack & self._came))
+
+    def trend(self, now: float) -> list[float | None]:
+        """The range [km] every `TREND_STEP` of the last ten minutes, the oldest first; None where it was not known.
+
+        Nothing while there is no range now.
+        """
+        if self.value("RANGE_Remaining", now) is None:
+            return []
+        step = int(now // TREND_STEP)
+        return [self._ranges.get(i) for i in range(step - TREND_STEPS + 1, step + 1)]
 
     def activity(self, now: float) -> str:
         """What the vehicle does, in a word; nothing if it is not known, or before there is an estimate."""

@@ -18,7 +18,7 @@ from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.present import Present
-from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, MissingSignals, loss_variance
+from gz_onboard.estimator.reasons import DEGRADING, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
 from gz_onboard.estimator.redundancy.electric import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
@@ -32,7 +32,7 @@ from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import COARSE, SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.estimator.weakest import Weakest
-from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
+from gz_onboard.events import NO_PACK, STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model

@@ -6,7 +6,7 @@ from collections.abc import Container
 
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.signals import FIX_3D, Signals
-from gz_onboard.events import ROLES, Reason
+from gz_onboard.events import OF_RIDING, ROLES, Reason
 
 # What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
 LOSS_SD = {
@@ -20,9 +20,6 @@ LOSS_SD = {
     Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
 }
 DEGRADING = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
-OF_RIDING = Reason.NO_SPEED | Reason.NO_IMU | Reason.NO_GPS | Reason.NO_INVERTER_CURRENT
-"""What sleeps on many vehicles while they are charged, and is not missed then."""
-NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 NEEDED = {
     Reason.NO_PACK_VOLTAGE: ("pack_voltage",),
     Reason.NO_PACK_CURRENT: ("pack_current",),

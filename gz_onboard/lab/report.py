@@ -1,4 +1,4 @@
-"""``gz-onboard report``: recorded rides as one HTML page that fetches nothing, for phone and desktop."""
+"""``gz-onboard report``: recorded rides as one self-contained HTML page, for phone and desktop."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from gz_onboard.lab.estimate import expected_frames
 from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.report_page import cells, contents, section
 from gz_onboard.lab.report_ride import ReportedRide, ReportTask, read_report
-from gz_onboard.lab.report_style import page
 from gz_onboard.offline.digest import distinct_logs
+from gz_onboard.offline.page import page
 from gz_onboard.offline.processes import collect, over_rides
 from gz_onboard.offline.samples import ride_name
 from gz_onboard.options import add_shared

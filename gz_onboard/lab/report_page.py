@@ -16,6 +16,7 @@ from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
 from gz_onboard.lab.report_ride import ReportedRide
 from gz_onboard.lab.report_svg import axis_of, draw_map
 from gz_onboard.lab.why import Why
+from gz_onboard.offline.page import tiles
 from gz_onboard.offline.results import FIRST_DATE_NS, clock, number
 from gz_onboard.offline.style import time_unit
 
@@ -89,15 +90,14 @@ def _tiles(ride: ReportedRide) -> str:
     s = ride.summary
     band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
     over = f"over {s.energy_distance_km:.2f} km: {lacks}" if (lacks := lacks_energy(s)) else "over the ride"
-    tiles = [
+    values = [
         ("distance", number(s.distance_km, ".2f", "km"), f"in {clock(s.duration_s)}"),
         ("energy", number(s.energy_wh, ".0f", "Wh"), f"drawn, {number(s.energy_recovered_wh, '.0f', 'Wh')} recovered"),
         ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), over),
         ("soc", _soc(ride), f"state of charge, ± {number(s.soc_end_sd, '.1f', '%', 100)}"),
         ("range", number(s.range_end_km, ".1f", "km"), band),
     ]
-    boxes = "".join(f'<div><b data-of="{key}">{value}</b><span>{text}</span></div>' for key, value, text in tiles)
-    return f'<div class="tiles">{boxes}</div>'
+    return tiles(values)
 
 
 def _map(ride: ReportedRide) -> str:

@@ -1,4 +1,4 @@
-"""Reports: tables as HTML or Markdown, pictures inside an HTML page that needs no other file."""
+"""Reports: one look for all self-contained HTML pages, tables as HTML or Markdown, pictures inside a page."""
 
 from __future__ import annotations
 
@@ -11,22 +11,65 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from gz_onboard.errors import writable
-from gz_onboard.offline.style import GRID, INK, picture_format, write
+from gz_onboard.offline.style import picture_format, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STYLE = f"""
-body {{ font-family: system-ui, sans-serif; color: {INK}; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }}
-table {{ border-collapse: collapse; margin: 0.5rem 0 1.5rem; font-size: 0.9rem; font-variant-numeric: tabular-nums; }}
-td, th {{ padding: 0.2rem 0.6rem; border-bottom: 1px solid {GRID}; text-align: left; vertical-align: top; }}
-th {{ font-weight: 600; vertical-align: bottom; }}
-.n, .bad {{ text-align: right; }} td.n, td.bad {{ white-space: nowrap; }}
-.bad {{ background: #fde8e8; color: #9b1c1c; font-weight: 600; }}
-.no {{ background: #fdf1e3; padding: 0.5rem 1rem; border-left: 4px solid #e9a03b; }}
-figure {{ margin: 1.5rem 0; }} svg {{ width: 100%; height: auto; }} img {{ width: 100%; }}
-pre {{ background: #f5f7fa; padding: 1rem; overflow-x: auto; }}
+_STYLE = """
+:root { color-scheme: light dark; --ground: #fff; --ink: #1f2933; --muted: #616e7c; --grid: #e4e7eb; --card: #f5f7fa;
+ --blue: #1667b7; --orange: #c2620a; --green: #2f855a; --red: #c53030; --purple: #6b46c1; --grey: #9fb3c8;
+ --amber: #e8a33d; }
+@media (prefers-color-scheme: dark) { :root { --ground: #12181f; --ink: #e4e7eb; --muted: #9aa5b1; --grid: #323f4b;
+ --card: #1f2933; --blue: #62b0f5; --orange: #f2a154; --green: #63c794; --red: #f58a8a; --purple: #b794f4;
+ --grey: #7b8794; --amber: #e8a33d; } }
+* { box-sizing: border-box; }
+body { font: 1rem/1.4 system-ui, sans-serif; color: var(--ink); background: var(--ground); max-width: 62rem;
+ margin: 0 auto; padding: 0 1rem 3rem; overflow-wrap: break-word; }
+h1 { font-size: 1.5rem; margin: 1.2rem 0 .3rem; } h2 { font-size: 1.3rem; margin: 2rem 0 .2rem; }
+h3 { font-size: 1rem; margin: 1.8rem 0 .3rem; } p { margin: .3rem 0; } a { color: var(--blue); }
+.about, .note, .unit, figcaption span { color: var(--muted); font-size: .85rem; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .6rem; margin: .8rem 0; }
+.tiles div { background: var(--card); border-radius: .5rem; padding: .5rem .7rem; }
+.tiles b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
+.tiles span { color: var(--muted); font-size: .8rem; }
+figure { margin: 1.6rem 0 0; } figcaption b { margin-right: .3rem; }
+.key { margin-left: .8rem; white-space: nowrap; }
+.key i { display: inline-block; width: .9rem; height: .25rem; margin-right: .3rem; vertical-align: middle;
+ background: currentColor; }
+.plot { position: relative; height: 9rem; margin: .6rem 1.4rem 2rem 2.6rem; }
+.plot svg, .strip svg, .bar svg { position: absolute; left: 0; width: 100%; height: 100%; overflow: visible; }
+.plot span { position: absolute; font-size: .75rem; color: var(--muted); line-height: 1; white-space: nowrap; }
+.plot .y { right: 100%; margin-right: .35rem; transform: translateY(-50%); }
+.plot .x { top: 100%; margin-top: .35rem; transform: translateX(-50%); }
+svg path { fill: none; stroke: currentColor; stroke-width: 1.4; vector-effect: non-scaling-stroke;
+ stroke-linejoin: round; stroke-linecap: round; }
+path.grid { stroke: var(--grid); stroke-width: 1; } path.band { fill: currentColor; stroke: none; opacity: .2; }
+path.box { fill: currentColor; stroke: none; } path.dashed { stroke-dasharray: 5 4; stroke: var(--muted); }
+path.way { stroke-width: 3; } path.dot { stroke-width: 12; } path.bar { stroke-width: 3; stroke: var(--ink); }
+.map { display: block; width: 100%; max-height: 34rem; background: var(--card); border-radius: .5rem; }
+.strip { margin: .5rem 1.4rem 0 2.6rem; font-size: .85rem; } .strip div { position: relative; height: .8rem; }
+.strip div { background: var(--card); }
+table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-numeric: tabular-nums; }
+td, th { padding: .25rem .5rem .25rem 0; border-bottom: 1px solid var(--grid); text-align: left; vertical-align: top; }
+th { font-weight: 600; } .n { text-align: right; white-space: nowrap; } .summary td:first-child { width: 8.5rem; }
+td.bar { width: 40%; position: relative; } td.bar svg { top: 15%; height: 70%; }
+.total tr:last-child { font-weight: 600; } .at { white-space: nowrap; } .scroll { overflow-x: auto; }
+.blue { color: var(--blue); } .orange { color: var(--orange); } .green { color: var(--green); }
+.red { color: var(--red); } .purple { color: var(--purple); } .grey { color: var(--grey); }
+.amber { color: var(--amber); } .muted { color: var(--muted); }
+.bad { text-align: right; white-space: nowrap; background: var(--red); color: var(--ground); font-weight: 600; }
+.no { background: var(--card); padding: .5rem .8rem; border-left: .25rem solid var(--amber); }
+pre { background: var(--card); border-radius: .5rem; padding: .8rem; overflow-x: auto; }
+summary { cursor: pointer; padding: .3rem 0; font-weight: 600; } nav a { margin-right: .8rem; }
+.wide table { min-width: 38rem; }
+.drawn { display: block; max-width: 100%; height: auto; } .scroll .drawn { max-width: none; }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(19rem, 100%), 1fr)); gap: 0 1rem; }
+@media (prefers-color-scheme: dark) { .drawn { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; } }
+@media print { figure, table { break-inside: avoid; } }
 """
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""What a browser may fetch for the page: nothing."""
 
 
 class Failed(str):
@@ -41,16 +84,30 @@ class Subheading(str):
     __slots__ = ()
 
 
+def page(title: str, body: Sequence[str]) -> str:
+    """A self-contained page for phone and desktop, light and dark; body: HTML."""
+    named = html.escape(title)
+    return "\n".join(
+        [
+            f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{named}</title>',
+            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+            f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head><body>',
+            *body,
+            "</body></html>\n",
+        ]
+    )
+
+
 def write_page(file: Path, title: str, body: Sequence[str]) -> None:
     """Write a page with `title` above the HTML of `body`. Raises OSError."""
-    named = html.escape(title)
-    lines = "\n".join(body)
-    file.write_text(
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{named}</title><style>{_STYLE}</style>'
-        f"</head><body><h1>{named}</h1>\n{lines}\n</body></html>\n",
-        encoding="utf-8",
-        errors="replace",
-    )
+    text = page(title, [f"<h1>{html.escape(title)}</h1>", *body])
+    file.write_text(text, encoding="utf-8", errors="replace")
+
+
+def tiles(values: Sequence[tuple[str, str, str]]) -> str:
+    """Cards of a (key, value, text) each; value and text: HTML."""
+    boxes = "".join(f'<div><b data-of="{key}">{value}</b><span>{text}</span></div>' for key, value, text in values)
+    return f'<div class="tiles">{boxes}</div>'
 
 
 def html_table(heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
@@ -66,7 +123,8 @@ def html_table(heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Seq
             lines.append(f"<th colspan={len(heads)}>{html.escape(row[0])}</th>")
         else:
             lines.append("".join(cell(i, text) for i, text in enumerate(row)))
-    return "<table>" + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+    wide = " wide" if len(heads) > 3 else ""
+    return f'<div class="scroll{wide}"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -94,11 +152,15 @@ def mark_of(maker: str) -> str:
     return f"<!-- made by {maker} from here on -->"
 
 
-def svg(figure: Figure) -> str:
-    """A figure as SVG inside a page, the same text for the same figure."""
-    stream = io.BytesIO()
-    write(figure, stream, "svg")
-    return "<svg" + stream.getvalue().decode("utf-8").partition("<svg")[2]
+def drawn(figure: Figure, label: str, colours: int = 64) -> str:
+    """A figure inside a page, small, the same bytes for the same figure; label: for those who cannot see it."""
+    from PIL import Image
+
+    png, webp = io.BytesIO(), io.BytesIO()
+    write(figure, png, "png", dpi=72)
+    few = Image.open(png).convert("RGB").quantize(colours, dither=Image.Dither.NONE)
+    few.save(webp, "webp", lossless=True, quality=100, method=6)
+    return embedded(webp.getvalue(), "webp", label)
 
 
 def image(file: Path) -> str:
@@ -109,6 +171,7 @@ def image(file: Path) -> str:
     return embedded(file.read_bytes(), "svg+xml" if kind == "svg" else kind)
 
 
-def embedded(picture: bytes, kind: str = "png") -> str:
+def embedded(picture: bytes, kind: str, label: str = "") -> str:
     """A picture inside a page."""
-    return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(picture).decode("ascii")}">'
+    data = base64.b64encode(picture).decode("ascii")
+    return f'<img class="drawn" alt="{html.escape(label)}" src="data:image/{kind};base64,{data}">'

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import writable, writing
-from gz_onboard.offline.page import svg, write_page
+from gz_onboard.offline.page import drawn, write_page
 from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Dropouts, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
@@ -81,24 +81,25 @@ def _draw(
 
     title = f"{plan.name}, {summary.kind} · {summary.vehicle}, payload {summary.payload_kg:g} kg"
     energy = figures.sankey(result.ledger, vehicle.model.effects, f"{title}: energy")
-    drawn = [("", figures.overview(result, title)), (".ledger", energy)]
+    pictures = [("", figures.overview(result, title)), (".ledger", energy)]
     if plan.recorded:
         columns = measured_columns(plan.recorded, result)
-        drawn.append((".measured", figures.comparison(result, columns, title)))
+        pictures.append((".measured", figures.comparison(result, columns, title)))
     variants = summary.sweep or []
     swept = f"{plan.name}, {summary.kind} · {summary.vehicle}"
     if all(sweep.name != "payload_mass" for sweep in sweeps):
         swept += f", payload {summary.payload_kg:g} kg"
     if len(sweeps) == 1:
-        drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, swept)))
+        pictures.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, swept)))
     elif sweeps:
         one, two = sweeps
         names, values = (one.label, two.label), (one.values, two.values)
-        drawn.append((".sweep", figures.sweep_map(names, values, variants, swept)))
-    for ending, figure in drawn:
+        pictures.append((".sweep", figures.sweep_map(names, values, variants, swept)))
+    for ending, figure in pictures:
         save(figure, file(f"{ending}.{picture_format}"))
     text = f"<pre>{html.escape(summary_text(summary))}</pre>"
-    write_page(file(".html"), title, [text, *(f"<figure>{svg(figure)}</figure>" for _, figure in drawn)])
+    shown = [f"<figure>{drawn(figure, ending.lstrip('.'))}</figure>" for ending, figure in pictures]
+    write_page(file(".html"), title, [text, *shown])
 
 
 def series_table(result: Run) -> dict[str, Array]:

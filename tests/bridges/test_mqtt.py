@@ -92,7 +92,7 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
             assert float(found["state_of_charge"]) == 62.4
             assert found["state"] == "degraded"
             assert found["activity"] == "riding"
-            assert found["alert"] == "sensor_lost"
+            assert found["alert"] == "none"
             assert found["reasons"] == "no_imu, prior_riding"
             assert "charge_power" not in found
             sender.estimate = replace(ESTIMATE, activity=Activity.CHARGING, charge_power=500.0, time_to_full=3600.0)

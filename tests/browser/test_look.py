@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gz_onboard.events import Reason, State
+from gz_onboard.events import NO_SENSOR, ROLES, Estimate, Reason, State
 from tests.browser.support import plain, shows, texts, wait_for
 from tests.browser.test_page import UNREACHABLE
 from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
@@ -23,11 +23,7 @@ def test_miles_and_german_are_kept(page):
         shows(page, range_value="34")
         page.click("#unit")
         shows(
-            page,
-            range_value="21",
-            interval="16 to 28 mi",
-            recent="40",
-            rated="besides the charge, against the rated 36 mi",
+            page, range_value="21", interval="16 to 28 mi", recent="40", rated="besides the charge; rated range 36 mi"
         )
         page.click("#language")
         shows(page, interval="16 bis 28 mi", compared="5 % weniger als erwartet", trust_word="gültig")
@@ -99,6 +95,75 @@ def test_it_fits(page, width, height, language):
             assert page.locator("#range-value").bounding_box()["height"] >= min(width, height) / 5
 
 
+EVERYTHING = replace(UNREACHABLE, reasons=~Reason(0), distrusted=tuple(ROLES))
+UNAVAILABLE = Estimate(time=0.0, state=State.INVALID, reasons=Reason.SIGNALS_SLOW | Reason.NO_GPS)
+NO_SCOOTER = Estimate(time=0.0, state=State.INVALID, reasons=NO_SENSOR)
+SEEN = "section *, header *, footer *, #alerts li:first-child"
+CLIPPED = (
+    f"() => [...document.querySelectorAll('{SEEN}')]"
+    + """.filter((e) => {
+  const box = e.getBoundingClientRect(), outer = (e.closest("section") ?? document.body).getBoundingClientRect();
+  const listed = e.closest("#state ul") && !e.matches("ul");  // a list ends where its place does
+  return e.checkVisibility() && !listed && (box.bottom > outer.bottom + 1 || box.right > outer.right + 1 ||
+    (e.matches("p, li") && e.scrollWidth > e.clientWidth + 1));
+}).map((e) => e.id || e.className || e.tagName)"""
+)
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize(("width", "height"), [(800, 480), (844, 390), (1024, 600), (1280, 800)])
+def test_in_landscape_nothing_scrolls_in_any_state(page, width, height, language):
+    page.set_viewport_size({"width": width, "height": height})
+    name = f"whole-{width}-{language}"
+    own = [odometer(1112.4), cells(-8, 24, 57)]
+    with dashboard(name, vehicle=vehicle_frames(1000.0)) as address, Sender(name, HEALTHY, own, 38) as sender:
+        page.goto(f"{address}?language={language}")
+        for estimate in HEALTHY, ESTIMATE, ON_ROUTE, CHARGING, UNREACHABLE, EVERYTHING, UNAVAILABLE:
+            sender.estimate = estimate
+            page.wait_for_timeout(1500)  # a range frame comes each second
+            assert texts(page)["trust"].startswith({State.VALID: "✓", State.DEGRADED: "!"}.get(estimate.state, "✕"))
+            assert page.evaluate("document.documentElement.scrollHeight <= innerHeight"), estimate
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            assert page.evaluate(CLIPPED) == [], estimate
+
+
+def test_the_scooter_is_waited_for(page):
+    """Sensors that never came are not lost; those that stop are."""
+    page.set_viewport_size({"width": 800, "height": 480})
+    with dashboard("before") as address, Sender("before", NO_SCOOTER) as sender:
+        page.goto(address)
+        shows(page, alerts="Waiting for the scooter.", trust_word="waiting", reasons="")
+        assert page.evaluate("document.documentElement.scrollHeight <= innerHeight")
+        sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
+        shows(page, alerts="", trust_word="degraded", range_value="34")
+        sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS | Reason.NO_IMU)
+        shows(page, alerts="Sensor lost: inertial unit.")
+
+
+def test_speed_clock_and_trend(page):
+    page.clock.set_fixed_time("2026-05-04T07:08:00")
+    with (
+        dashboard("small", vehicle=vehicle_frames(1000.0), trend=[41e3, 40e3, 38e3, 37e3]) as address,
+        Sender("small", HEALTHY, km_h=38) as sender,
+    ):
+        page.goto(address)
+        shows(page, speed="38 km/h", clock="07:08")
+        page.click("#unit")
+        shows(page, speed="24 mph")
+        page.click("#unit")
+        shows(page, range_value="34")
+        label = plain(page.get_attribute("#trend svg", "aria-label"))
+        assert label == "Range over the last ten minutes: 41 km, now 34 km."
+        heights = [
+            float(y)
+            for y in page.get_attribute("#trend path", "d").replace("L", "M").split("M")[1:]
+            for y in y.split()[1:]
+        ]
+        assert heights[-1] > heights[0]  # downwards
+        sender.estimate = replace(HEALTHY, state=State.INVALID)
+        wait_for(lambda: not page.is_visible("#trend"), "no trend without a range")
+
+
 CONTRASTS = """() => {
   const luminance = (c) => c.slice(0, 3).map((v) => v / 255)
     .map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
@@ -163,7 +228,7 @@ def test_a_screen_reader_hears_changes_of_state_and_not_every_tick(page):
         page.wait_for_timeout(2500)  # longer than what is read out must have held
         assert page.evaluate("said") == []
         sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
-        shows(page, announcer="Range degraded. A sensor is lost: no GPS.")
+        shows(page, announcer="Range degraded. Sensor lost: GPS.")
         assert page.evaluate("said.length") == 1
 
 

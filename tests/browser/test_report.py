@@ -1,4 +1,4 @@
-"""The page of a ride in Chromium says what the estimates say, on phone and desktop, and fetches nothing."""
+"""The page of a ride in Chromium says what the estimates say, on phone and desktop, and is self-contained."""
 
 from __future__ import annotations
 

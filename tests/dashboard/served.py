@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 from gz_onboard.bus._can import can
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
+from gz_onboard.dashboard.pictures import clock
 from gz_onboard.dashboard.server import Feed
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
-from gz_onboard.dashboard.view import View
+from gz_onboard.dashboard.view import TREND_STEP, View
 from gz_onboard.dashboard.web import feed_from, served
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.vehicle import read_vehicle
-from tests.dashboard.test_terminal import COUNTS, send
+from tests.dashboard.test_terminal import COUNTS, ESTIMATE, send
 
 VEHICLE = load_database([find_dbc("vehicle.dbc")])
 
 
 @contextmanager
-def dashboard(channel: str, listen: str = "127.0.0.1:0", vehicle: VehicleFrames | None = None) -> Iterator[str]:
-    """The address of a dashboard of the virtual bus `channel`."""
+def dashboard(
+    channel: str, listen: str = "127.0.0.1:0", vehicle: VehicleFrames | None = None, trend: Sequence[float] = ()
+) -> Iterator[str]:
+    """The address of a dashboard of the virtual bus `channel`, which has seen the ranges `trend` [m], 10 s apart."""
     view, stop, feed = View(vehicle=vehicle), threading.Event(), Feed()
+    publisher, start = Publisher(), clock() - TREND_STEP * len(trend)
+    for i, metres in enumerate(trend):
+        past = replace(ESTIMATE, range=metres, range_p10=0.9 * metres, range_p90=1.1 * metres)
+        for frame in publisher.range(past, COUNTS, 0):
+            view.take(frame, start + TREND_STEP * i)
     bus = CanChannel("virtual", channel, identifiers=view.identifiers)
     bus.open()
     with served(feed, listen) as address:
@@ -67,6 +77,11 @@ def odometer(km: float) -> Own:
     return "VCU_Odometer", {"VCU_Odometer": km}
 
 
+def motion(km_h: float) -> Own:
+    """What the motor turns at this speed."""
+    return "INV_Motion", {"INV_MotorSpeed": km_h / 3.6 / 0.2438 * 60 / (2 * math.pi)}
+
+
 def vehicle_frames(begin: float) -> VehicleFrames:
     """Of the reference scooter, whose odometer was at `begin` [km] when the day began."""
     made = VehicleFrames(read_vehicle("reference"))
@@ -78,9 +93,10 @@ def vehicle_frames(begin: float) -> VehicleFrames:
 class Sender:
     """What a daemon sends, in its rhythm, of an estimate that can be changed meanwhile."""
 
-    def __init__(self, channel: str, estimate: Estimate, own: Sequence[Own] = ()) -> None:
+    def __init__(self, channel: str, estimate: Estimate, own: Sequence[Own] = (), km_h: float | None = None) -> None:
         self.estimate = estimate
         self.own = own
+        self.km_h = km_h
         self._channel = channel
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -93,6 +109,8 @@ class Sender:
                     send(bus, publisher.range(self.estimate, COUNTS, 0))
                     send(bus, [own_frame(*own) for own in self.own])
                 send(bus, publisher.status(self.estimate, 0))
+                if self.km_h is not None:
+                    send(bus, [own_frame(*motion(self.km_h))])
                 number += 1
 
     def __enter__(self) -> Sender:

@@ -16,7 +16,7 @@ from gz_onboard.dashboard.picture import ALERTS, NO_LONGER_EMPTY, Picture, pictu
 from gz_onboard.dashboard.server import STATIC
 from gz_onboard.dashboard.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import KEEPING, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
+from gz_onboard.events import KEEPING, NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, second, seen
 
 SOURCE = "vcan0", "socketcan"
@@ -54,8 +54,10 @@ def test_every_number_of_the_frames():
         "state": "degraded",
         "activity": "riding",
         "range": {"km": 34.21, "p10_km": 26.54, "p90_km": 44.34},
+        "range_10min_km": [*[None] * 59, 34.21],
         "battery": {"soc_percent": 62.4, "soc_sigma_percent": 1.2, "energy_left_wh": 895.0},
         "cells": None,
+        "speed_km_h": None,
         "odometer_km": None,
         "ridden_today_km": None,
         "consumption": {"recent_wh_per_km": 24.6, "expected_wh_per_km": 26.2},
@@ -64,10 +66,11 @@ def test_every_number_of_the_frames():
         "rated_km": 57.6,
         "causes": [{"cause": "temperature", "km": -3.4}, {"cause": "stops", "km": 1.6}],
         "reasons": ["no_imu", "prior_riding"],
+        "lost": [],
         "distrusted": [],
         "late": [],
         "stale": [],
-        "alerts": ["sensor_lost"],
+        "alerts": [],
         "age_s": 0.0,
         "counts": {"received": 17, "lost": 0, "bad": 0},
     }
@@ -129,7 +132,7 @@ def test_what_is_late_is_said():
     [
         (HEALTHY, ()),
         (replace(HEALTHY, reasons=Reason.PRIOR_RIDING), ()),
-        (replace(HEALTHY, reasons=Reason.NO_GPS), ("sensor_lost",)),
+        (replace(HEALTHY, reasons=Reason.NO_GPS), ()),
         (replace(HEALTHY, reasons=Reason.SENSOR_DISTRUSTED, distrusted=("gps_altitude",)), ("sensor_lost",)),
         (replace(HEALTHY, state=State.INVALID), ("range_invalid",)),
         (replace(HEALTHY, soc=0.15), ("battery_nearly_empty",)),
@@ -147,6 +150,56 @@ def test_what_is_late_is_said():
 )
 def test_alerts(estimate, alerts):
     assert of(estimate).alerts == alerts
+
+
+def followed(*estimates: Estimate) -> Picture:
+    """The picture after these, one a second."""
+    view, publisher = View(), Publisher()
+    for number, estimate in enumerate(estimates):
+        for frame in second(publisher, estimate):
+            view.take(frame, 100.0 + number)
+    return picture(view, 100.0 + number, SOURCE, up=True)
+
+
+STARTING = Estimate(time=0.0, reasons=NO_SENSOR)
+NO_SCOOTER = replace(STARTING, state=State.INVALID)
+WITHOUT_GPS = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
+AT_A_CHARGER = replace(CHARGING, soc=0.5)
+
+
+@pytest.mark.parametrize(
+    ("estimates", "alerts", "lost"),
+    [
+        ([STARTING], ("waiting",), Reason(0)),
+        ([STARTING, NO_SCOOTER], ("waiting",), Reason(0)),
+        ([STARTING, WITHOUT_GPS], (), Reason(0)),  # it never came
+        ([STARTING, HEALTHY, WITHOUT_GPS], ("sensor_lost",), Reason.NO_GPS),
+        ([HEALTHY, WITHOUT_GPS, STARTING, WITHOUT_GPS], (), Reason(0)),  # a daemon that was started again
+        ([AT_A_CHARGER, WITHOUT_GPS], (), Reason(0)),  # while charging it is not missed
+        ([STARTING, AT_A_CHARGER, HEALTHY, WITHOUT_GPS], ("sensor_lost",), Reason.NO_GPS),
+        ([HEALTHY, replace(NO_SCOOTER, activity=Activity.ASLEEP)], ("waiting",), NO_SENSOR),
+        ([HEALTHY, NO_SCOOTER], ("range_invalid", "sensor_lost"), NO_SENSOR),  # on the way
+        (
+            [replace(NO_SCOOTER, reasons=Reason.NO_PACK_VOLTAGE, activity=Activity.RIDING)],
+            ("range_invalid",),
+            Reason(0),
+        ),
+    ],
+)
+def test_only_a_sensor_that_came_is_lost(estimates, alerts, lost):
+    found = followed(*estimates)
+    assert found.alerts == alerts
+    assert found.lost == tuple(str(reason.name).lower() for reason in lost)
+
+
+def test_the_range_of_the_last_ten_minutes():
+    view, publisher = View(), Publisher()
+    for number in range(80):
+        for frame in publisher.range(replace(HEALTHY, range=(40 - number / 10) * 1e3), COUNTS, 0):
+            view.take(frame, 1000.0 + 10 * number)
+    trend = picture(view, 1790.0, SOURCE, True).range_10min_km
+    assert trend == pytest.approx([40 - number / 10 for number in range(20, 80)])
+    assert picture(view, 1805.0, SOURCE, True).range_10min_km == ()  # nothing known now
 
 
 def test_alerts_of_a_bus():
@@ -237,8 +290,8 @@ def keys(data: object, before: str = "") -> set[str]:
 def test_there_is_a_word_for_everything(language):
     text = words(language)
     groups = {
-        "states": [*(state.name.lower() for state in State), "none"],
-        "meanings": [*(state.name.lower() for state in State), "none"],
+        "states": [*(state.name.lower() for state in State), "none", "waiting"],
+        "meanings": [*(state.name.lower() for state in State), "none", "waiting"],
         "activities": [activity.name.lower() for activity in Activity],
         "reasons": [str(reason.name).lower() for reason in Reason],
         "causes": [cause.name.lower() for cause in Cause if cause],

@@ -27,7 +27,7 @@ from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.dashboard import screen
 from gz_onboard.dashboard.screen import Style
 from gz_onboard.dashboard.view import View
-from gz_onboard.events import ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State, words
+from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State, words
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(
@@ -87,7 +87,7 @@ def test_it_shows_what_the_daemon_sends():
         "Why               temperature -3.4 km, stops +1.6 km\n                    besides the charge; rated 57.6 km",
         "degraded",
         "no IMU: No lean",
-        "prior riding",
+        "less than 3 km ridden",
         "0.0 s old, 17 received, 0 lost, 0 bad",
         "Activity          riding",
         "7 dropped, 3 implausible, 24 lost, 2 unknown",
@@ -98,14 +98,14 @@ def test_it_shows_what_the_daemon_sends():
     assert line == (
         "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
         "26.2 Wh/km expected; degraded; riding; why, besides charge: temperature -3.4 km, stops +1.6 km; "
-        "degraded because: no IMU, prior riding"
+        "degraded because: no IMU, less than 3 km ridden"
     )
 
 
-def test_reasons_of_a_valid_estimate_make_it_less_certain():
+def test_reasons_of_a_valid_estimate_widen_its_interval():
     view = seen(replace(ESTIMATE, state=State.VALID, reasons=Reason.PRIOR_RIDING))
-    assert "Less certain      prior riding" in picture(view, 100.0)
-    assert screen.summary_line(view, 100.0).endswith("; less certain because: prior riding")
+    assert "Wider interval    less than 3 km ridden" in picture(view, 100.0)
+    assert screen.summary_line(view, 100.0).endswith("; wider interval: less than 3 km ridden")
 
 
 @pytest.mark.parametrize("state", [State.VALID, State.DEGRADED])
@@ -114,12 +114,20 @@ def test_what_cannot_be_kept_makes_no_range_less_certain(state):
     view = seen(replace(ESTIMATE, state=state, reasons=reasons))
     text = picture(view, 100.0)
     assert "Note              log failed" in text
-    assert "Less certain" not in text
+    assert "Wider interval" not in text
     assert ("Because           SOC restarted" in text) is (state is State.DEGRADED)
     line = screen.summary_line(view, 100.0)
     assert line.endswith("; note: log failed, save failed")
     assert ("degraded because: SOC restarted;" in line) is (state is State.DEGRADED)
-    assert "certain" not in line
+    assert "wider" not in line
+
+
+def test_a_scooter_that_is_not_on_is_waited_for():
+    view = seen(Estimate(time=0.0, state=State.INVALID, reasons=NO_SENSOR | Reason.LOG_FAILED))
+    text, line = picture(view, 100.0), screen.summary_line(view, 100.0)
+    assert "State             waiting for the scooter" in text
+    assert "; waiting for the scooter; note: log failed" in line
+    assert not re.search("no IMU|because|invalid", text + line)
 
 
 def test_the_bar_stands_where_the_numbers_are():
@@ -139,7 +147,7 @@ def test_an_old_number_is_never_shown_as_if_fresh():
     for late in 110.1, 1e4, 1e9:
         text = picture(view, late)
         assert not numbers(text)
-        assert "not known" in text
+        assert "unknown" in text
         assert all(f"{name}: last came" in text for name in view.messages)
         assert set(re.findall(r"[\d.]+ km", screen.summary_line(view, late))) == set()
 

@@ -338,7 +338,7 @@ def test_pictures_and_page(two):
         assert Path(entry["plot"]).stat().st_size > 50_000
     page = (out / "validation.html").read_text()
     assert page.count("data:image/png;base64,") == 2
-    assert "http" not in page
+    assert "://" not in page
     assert "Where the model fails" in page
     assert "class=bad" in page
 

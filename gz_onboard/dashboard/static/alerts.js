@@ -2,6 +2,7 @@
 import { DASH, distance, known, number, percent } from "./numbers.js";
 import { said, word, words } from "./words.js";
 
+const NOTES = ["waiting"];
 const WARNINGS = ["destination_uncertain", "sensor_lost", "partly_silent", "cell_too_cold"];  // the others are critical
 const SETTLED = 1500;  // ms that something holds before it is read out
 const AGAIN = 60000;  // ms until the same is read out once more
@@ -17,7 +18,8 @@ function text(alert, picture) {
   if (alert === "silent" && !picture.heard) alert = "unheard";
   const end = picture?.route?.battery_ends_after_km;
   if (alert === "destination_unreachable" && known(end)) alert = "destination_unreachable_after";
-  const lost = (picture?.reasons ?? []).filter((name) => name.startsWith("no_")).map((name) => word("reasons", name));
+  // "no GPS" is a reason; what is lost is the GPS.
+  const lost = (picture?.lost ?? []).map((name) => word("reasons", name).replace(/^(no|keine?) /, ""));
   const bad = (picture?.distrusted ?? []).map((name) => word("sensors", name));
   return said(texts[alert] ?? alert, {
     channel: picture?.channel ?? "",
@@ -39,13 +41,14 @@ export function drawAlerts(picture, problem) {
   list.replaceChildren(
     ...lines.map(([alert, line]) => {
       const item = document.createElement("li");
-      item.className = WARNINGS.includes(alert) ? "warning" : "critical";
+      item.className = NOTES.includes(alert) ? "note" : WARNINGS.includes(alert) ? "warning" : "critical";
       item.dataset.alert = alert;
       item.textContent = line;
       return item;
     }),
   );
-  if (lines.length > 1) list.firstChild.dataset.more = `(+${lines.length - 1})`;
+  // How many come after each: a small screen shows only the first ones.
+  [...list.children].slice(0, -1).forEach((item, i) => { item.dataset.more = `(+${lines.length - 1 - i})`; });
 }
 
 // Reads out what has begun to hold: state, activity, alerts. Not what only moves, such as a number in an alert.

@@ -1,13 +1,13 @@
 // One picture onto the page. Every number that it does not have is a dash; nothing of the last one stays.
 import { announce, drawAlerts } from "./alerts.js";
 import { drawBand } from "./band.js";
-import { DASH, change, consumption, distance, distanceOnly, duration, energy, known, number, perUnit, percent, power } from "./numbers.js";
+import { DASH, change, clock, consumption, distance, distanceOnly, duration, energy, known, number, perUnit, percent, power, speed } from "./numbers.js";
 import { settings } from "./settings.js";
 import { said, word, words } from "./words.js";
 
 const NOTHING = {
-  channel: "", state: null, activity: null, range: { km: null, p10_km: null, p90_km: null },
-  battery: { soc_percent: null, soc_sigma_percent: null, energy_left_wh: null }, cells: null, ridden_today_km: null,
+  channel: "", state: null, activity: null, range: { km: null, p10_km: null, p90_km: null }, range_10min_km: [],
+  battery: { soc_percent: null, soc_sigma_percent: null, energy_left_wh: null }, cells: null, speed_km_h: null, ridden_today_km: null,
   consumption: { recent_wh_per_km: null, expected_wh_per_km: null }, charge: null, route: null, rated_km: null,
   causes: [], reasons: [], distrusted: [], late: [], stale: [], alerts: [], counts: null,
 };
@@ -17,8 +17,9 @@ const SHOWN_BY = {  // the places that a message fills
   cell_temperature: ["cells"], odometer: ["ridden"],
 };
 const KEEPING = ["log_failed", "save_failed"];
-const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?" };
+const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?", waiting: "…" };
 const SAME = 0.03;  // a consumption so near to the expected is as expected
+const LEAST_CHANGE = 0.2;  // of the range: a trend that changes less does not fill its height
 const byId = (id) => document.getElementById(id);
 
 function put(id, text) {
@@ -36,10 +37,10 @@ function bullets(id, title, lines) {
   if (list.dataset.drawn === text) return;
   list.dataset.drawn = text;
   list.replaceChildren(
-    ...(lines.length ? [title, ...lines] : []).map((line) => {
+    ...(lines.length ? [title, ...lines] : []).flatMap((line, i) => {
       const item = document.createElement("li");
-      item.textContent = line;
-      return item;
+      item.textContent = title && i > 0 && i < lines.length ? `${line},` : line;
+      return [item, " "];  // where they share a line, a space is between them
     }),
   );
 }
@@ -51,6 +52,22 @@ function drawRange({ range, route, ridden_today_km: ridden }) {
   put("share", known(range.km) ? words().share : "");
   put("ridden", known(ridden) ? said(words().ridden, { ridden: distance(ridden) }) : "");
   drawBand(range, route, ridden);
+}
+
+// The range of the last ten minutes as a line, the present at its right end; nothing before there are two points.
+function drawTrend(trend) {
+  const points = trend.map((km, i) => [i, km]).filter(([, km]) => known(km));
+  hide("trend", points.length < 2);
+  if (points.length < 2) return;
+  const values = points.map(([, km]) => km);
+  const middle = (Math.max(...values) + Math.min(...values)) / 2;
+  const half = Math.max(Math.max(...values) - middle, (LEAST_CHANGE * middle) / 2, 1e-3);
+  const at = ([i, km]) => `${((100 * i) / (trend.length - 1)).toFixed(1)} ${(50 - (50 * (km - middle)) / half).toFixed(1)}`;
+  const joined = (i) => i > 0 && points[i][0] - points[i - 1][0] === 1;
+  const path = points.map((point, i) => `${joined(i) ? "L" : "M"}${at(point)}`).join("");
+  const svg = byId("trend").firstElementChild;
+  svg.firstElementChild.setAttribute("d", path);
+  svg.setAttribute("aria-label", said(words().trend, { first: distance(values[0]), last: distance(values.at(-1)) }));
 }
 
 function drawBattery({ battery, cells }) {
@@ -110,7 +127,8 @@ function drawWhy({ causes, rated_km: rated }) {
 }
 
 function drawState(picture, problem) {
-  const state = picture.state ?? "none";
+  const waiting = picture.alerts.includes("waiting");
+  const state = waiting ? "waiting" : picture.state ?? "none";
   byId("trust").dataset.state = state;
   put("trust-sign", SIGNS[state] ?? "");
   put("trust-word", word("states", state));
@@ -120,8 +138,8 @@ function drawState(picture, problem) {
   const [kept, why] = [true, false].map((is) => picture.reasons.filter((name) => KEEPING.includes(name) === is));
   const notes = kept.map((name) => word("reasons", name)).map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
   put("meaning", [word("meanings", state), ...notes].join(" "));
-  const because = said(state === "valid" ? words().less_certain : words().because, { state: word("states", state) });
-  bullets("reasons", because, why.map((name) => word("reasons", name)));
+  const because = said(state === "valid" ? words().wider : words().because, { state: word("states", state) });
+  bullets("reasons", because, why.filter((name) => !waiting || !name.startsWith("no_")).map((name) => word("reasons", name)));
   bullets("distrusted", words().left_out, picture.distrusted.map((name) => word("sensors", name)));
   const named = (names) => names.map((name) => word("messages", name));
   const late = picture.late.filter((name) => !picture.stale.includes(name));
@@ -150,7 +168,10 @@ export function draw(picture, problem) {
   if (drawnFor !== wanted) drawWords();
   drawnFor = wanted;
   const shown = problem || !picture ? NOTHING : picture;
+  put("speed", speed(shown.speed_km_h));
+  put("clock", picture || problem ? clock() : "");
   drawRange(shown);
+  drawTrend(shown.range_10min_km);
   drawBattery(shown);
   drawConsumption(shown);
   drawCharge(shown);

@@ -27,6 +27,16 @@ export const change = (km) => `${number(km / perUnit(), 1, true)}${GAP}${setting
 export const consumption = (whPerKm) => number(known(whPerKm) ? whPerKm * perUnit() : null);
 export const percent = (value, digits = 0) => (known(value) ? `${number(value, digits)}${GAP}%` : DASH);
 
+// Speed and the time of day as short as they go; miles per hour have a name of their own.
+export const speed = (kmh) => (known(kmh) ? `${number(kmh / perUnit())}${GAP}${settings.unit === "mi" ? "mph" : "km/h"}` : "");
+
+// Nothing on a board that was not told the time yet.
+export function clock() {
+  const now = new Date();
+  if (now.getFullYear() < 2001) return "";
+  return now.toLocaleTimeString(settings.language, { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+}
+
 // Watts below a kilowatt, then kilowatts.
 export function power(watts) {
   if (!known(watts)) return DASH;

@@ -62,7 +62,7 @@ def _score(job: Job, values: network.Values, runs: Sequence[CoolingRun], held_ou
 def _panels(job: Job, values: network.Values, runs: Sequence[CoolingRun], held: Sequence[CoolingRun]) -> list[Panel]:
     panels = []
     for run in [*runs, *held]:
-        x, traces, left, modelled = run.time - run.time[0], [], [], job.model(values, run)
+        x, traces, modelled = run.time - run.time[0], [], job.model(values, run)
         for sensor, model in modelled.items():
             if sensor in run.measured:
                 label = sensor.removesuffix("_temperature").replace("_", " ")
@@ -70,12 +70,8 @@ def _panels(job: Job, values: network.Values, runs: Sequence[CoolingRun], held: 
                     PlotLine(f"{label}, measured", x, run.measured[sensor], "."),
                     PlotLine(f"{label}, model", x, model),
                 ]
-                left.append(PlotLine(label, x, run.measured[sensor] - model))
         title = f"{run.name}{' (held out)' if run in held else ''}"
-        panels += [
-            Panel(title, "time [s]", "temperature [degC]", tuple(traces)),
-            Panel(f"{title}: residual", "time [s]", "measured less model [K]", tuple(left)),
-        ]
+        panels.append(Panel(title, "time [s]", "temperature [degC]", tuple(traces)))
     return panels
 
 

@@ -1,4 +1,4 @@
-"""The report of a calibration: one HTML page that needs nothing else, and the same as JSON."""
+"""The report of a calibration: one self-contained HTML page, and the same as JSON."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import thesis
 from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result
-from gz_onboard.offline.page import html_table, svg, write_page
+from gz_onboard.offline.page import drawn, html_table, write_page
 from gz_onboard.offline.schema import descriptions
-from gz_onboard.offline.style import INK, MUTED, new_figure, rule
+from gz_onboard.offline.style import MUTED, new_figure, rule
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 VERSION = 1
 _COLOURS = ("#1f6feb", "#d1495b", "#2a9d8f", "#e9a03b", "#7b5ea7", "#52606d", "#8c564b", "#17a2b8")
 _MOST_POINTS = 4000  # of a trace: more than a picture shows
+_PICTURE_COLOURS = 16  # of a picture: a panel has few lines
+_MOST_OPEN = 8  # panels of a procedure: more are behind a click
 _MOST_TIED = 12  # parameters: a table of more correlations is not read
 
 
@@ -121,7 +123,7 @@ def write_report(file: Path, title: str, results: Sequence[Result], trouble: Exc
     trouble: why there is no more, or no vehicle file.
     """
     names = [html.escape(result.procedure) for result in results]
-    body = [f"<p>{', '.join(f'<a href={chr(34)}#{name}{chr(34)}>{name}</a>' for name in names)}</p>"]
+    body = ["<nav>" + "".join(f'<a href="#{name}">{name}</a>' for name in names) + "</nav>"]
     body += [f'<p class="no">Not finished: {html.escape(str(trouble))}</p>'] if trouble else []
     body += [_section(result) for result in results]
     if rows := thesis.compare(results):
@@ -133,7 +135,7 @@ def _section(result: Result) -> str:
     parts = [f'<h2 id="{html.escape(result.procedure)}">{html.escape(result.procedure)}</h2>']
     if result.parameters:
         rows = [[name, plus_minus(f.value, f.sd), f.unit, f.source] for name, f in result.parameters.items()]
-        parts.append(html_table(["parameter", "value ± sd", "unit", "source"], rows, [0, 1, 2]))
+        parts.append(html_table(["parameter", "value ± sd", "unit", "source"], rows, [1]))
     if result.curves:
         rows = [[name, shape(c), c.source] for name, c in result.curves.items()]
         parts.append(html_table(["table", "values", "source"], rows, [0]))
@@ -153,7 +155,9 @@ def _section(result: Result) -> str:
     parts += [f'<p class="no">Not identified by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
     parts += [f"<p>{html.escape(note)}</p>" for note in result.notes]
     if result.panels:
-        parts.append(f"<figure>{picture(result.panels)}</figure>")
+        pictures, shown = "".join(map(picture, result.panels)), " open" if len(result.panels) <= _MOST_OPEN else ""
+        summary = f"<summary>Pictures ({len(result.panels)})</summary>"
+        parts.append(f'<details{shown}>{summary}<div class="panels">{pictures}</div></details>')
     return "\n".join(parts)
 
 
@@ -170,20 +174,16 @@ def fit_row(fit: Fit) -> list[str]:
     ]
 
 
-def picture(panels: Sequence[Panel]) -> str:
-    """The panels of a procedure as one SVG, two beside each other; points as pixels, so that it stays small."""
-    rows = math.ceil(len(panels) / 2)
-    columns = min(len(panels), 2)
-    figure = new_figure(6.2 * columns, 3.6 * rows)
-    figure.set_dpi(110)
+def picture(panel: Panel) -> str:
+    """A panel as an HTML figure."""
+    figure = new_figure(6.2, 3.4)
     figure.set_layout_engine("constrained")
-    for i, panel in enumerate(panels):
-        _draw(figure.add_subplot(rows, columns, i + 1), panel)
-    return svg(figure)
+    _draw(figure.add_subplot(), panel)
+    title = f"<figcaption><b>{html.escape(panel.title)}</b></figcaption>"
+    return f"<figure>{title}{drawn(figure, panel.title, _PICTURE_COLOURS)}</figure>"
 
 
 def _draw(axis: Axes, panel: Panel) -> None:
-    axis.set_title(panel.title, fontsize=10, color=INK, loc="left")
     axis.set_xlabel(panel.x_label, fontsize=9, color=MUTED)
     axis.set_ylabel(panel.y_label, fontsize=9, color=MUTED)
     rule(axis)
@@ -199,7 +199,6 @@ def _draw(axis: Axes, panel: Panel) -> None:
             label=trace.label or None,
             markersize=3 if points else 5,
             linewidth=1.3,
-            rasterized=points and len(x) > 200,
         )
         labels += bool(trace.label)
     if labels:

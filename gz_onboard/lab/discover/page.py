@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,9 +21,9 @@ from gz_onboard.lab.discover.strain import in_words as strain_words
 from gz_onboard.lab.discover.unexplained import in_words
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
-from gz_onboard.offline.page import embedded, html_table, write_page
+from gz_onboard.offline.page import drawn, html_table, tiles, write_page
 from gz_onboard.offline.results import clock
-from gz_onboard.offline.style import save, write
+from gz_onboard.offline.style import save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,12 +45,12 @@ def write_report(found: Discovery, out: Path, picture_format: str | None = None)
     def kept(figure: Figure, name: str) -> str:
         if picture_format:
             save(figure, out.with_name(f"{out.stem}.{name}.{picture_format}"))
-        return _picture(figure)
+        return f'<div class="scroll">{drawn(figure, readable(name))}</div>'
 
     write_page(out, f"{found.mixed.vehicle.name}: {found.report.verdict}", [body(found, kept)])
 
 
-def body(found: Discovery, picture: Picture = lambda figure, _: _picture(figure)) -> str:
+def body(found: Discovery, picture: Picture) -> str:
     """The report as HTML, below its title; picture: gives that of a figure with a name."""
     report = found.report
     before, after = before_and_after(found)
@@ -94,24 +93,22 @@ def _head(found: Discovery) -> str:
     ridden = extent(found.lines)
     known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
     cards = [
-        (f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
-        (f"{ridden.distance / 1e3:.1f} km", "ridden"),
-        (clock(ridden.time), "in"),
+        ("rides", f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
+        ("distance", f"{ridden.distance / 1e3:.1f} km", f"in {clock(ridden.time)}"),
     ]
     if ridden.energy > 0:
-        cards.append((f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))
+        cards.append(("energy", f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))
     share = sum(cause.energy_share for cause in report.causes)
     if report.causes:
-        cards.append((f"{share:+.1%}", "of the energy named"))
+        cards.append(("share", f"{share:+.1%}", "of the energy named"))
     elif report.unknown:
-        cards.append((f"{report.unknown.share:+.1%}", "of the energy, without a name"))
+        cards.append(("share", f"{report.unknown.share:+.1%}", "of the energy, without a name"))
     if (error := report.gain.range) is not None:
-        cards.append((f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
-    values, words = zip(*cards, strict=True)
+        cards.append(("error", f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
     rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
     return (
         f"<p>{VERDICTS[report.verdict]}.</p>"
-        f"<p>{rides}; against the vehicle as known from {known}.</p>{html_table(words, [values])}"
+        f'<p class="about">{rides}; against the vehicle as known from {known}.</p>{tiles(cards)}'
     )
 
 
@@ -280,9 +277,3 @@ def _notes(report: Report) -> str:
     if not report.notes:
         return ""
     return "<h2>Notes</h2><ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in report.notes) + "</ul>"
-
-
-def _picture(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    write(figure, buffer, "png", dpi=100)
-    return embedded(buffer.getvalue())

@@ -69,7 +69,7 @@ def panels(stages: Stages, channel: str) -> Figure:
     if not drawn:
         return figure
     grid = figure.add_gridspec(
-        rows, columns, left=0.06, right=0.985, wspace=0.13, hspace=0.42, top=1 - 0.3 / height, bottom=0.48 / height
+        rows, columns, left=0.075, right=0.985, wspace=0.13, hspace=0.42, top=1 - 0.3 / height, bottom=0.48 / height
     )
     axes: list[Any] = []
     for i, (name, curves) in enumerate(drawn):

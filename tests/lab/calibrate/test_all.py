@@ -24,8 +24,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     """(vehicle file, answer in JSON) of the whole calibration, half a minute."""
     folder = tmp_path_factory.mktemp("calibration")
     out, answer = folder / "reference.toml", folder / "answer.json"
-    assert main(["calibrate", "all", str(DATA), "--output", str(out), "--json", str(answer)]) == 0
+    written = ["--output", str(out), "--json", str(answer), "--report", str(folder / "report.html")]
+    assert main(["calibrate", "all", str(DATA), *written]) == 0
     return out, json.loads(answer.read_text())
+
+
+def test_its_page_is_small_and_shows_no_picture_twice(made):
+    text = made[0].with_name("report.html").read_text()
+    pictures = re.findall(r"base64,([^\"]+)", text)
+    assert len(pictures) == len(set(pictures)) > 70
+    assert len(text.encode()) < 500_000
 
 
 def test_it_is_the_file_that_is_shipped(made):

@@ -36,7 +36,7 @@ def test_one_procedure_gives_file_report_and_json(tmp_path, capsys):
         assert vehicle.parameters.known[name].source == found[name]["source"]
     assert vehicle.parameters["drag_area"] == read_vehicle("reference").parameters["drag_area"]
     assert "Back-EMF" in page.read_text()
-    assert page.read_text().count("<svg") == 1
+    assert page.read_text().count("<img") == 4
 
 
 def test_an_option_changes_what_is_used(capsys):

@@ -55,8 +55,8 @@ def test_the_page_needs_nothing_else_and_says_all(tmp_path):
     words = " ".join(page.words)
     for said in ("A & B", "0.500 ± 0.030", "runs <1> & 2", "two runs (held out)", "0.9900", "+0.50", "± 3 %", "a note"):
         assert said in words
-    assert "svg" in page.tags
-    assert file.stat().st_size < 600_000  # points are thinned
+    assert {"img", "meta"} <= set(page.tags)
+    assert file.stat().st_size < 100_000
     again = tmp_path / "s.html"
     write_report(again, "A & B", [a_result()])
     assert again.read_bytes() == file.read_bytes()
@@ -106,4 +106,4 @@ def test_thinning_keeps_the_start():
 
 
 def test_a_picture_of_one_panel():
-    assert picture(a_result().panels[:1]).startswith("<svg")
+    assert 1_000 < len(picture(a_result().panels[0])) < 20_000
