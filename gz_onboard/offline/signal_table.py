@@ -98,7 +98,11 @@ def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, 
     order = {role: i for i, role in enumerate(_LAST)}
     used = sorted((c for c in columns if c.name in played), key=lambda c: order.get(played[c.name], -1))
     values = {column.name: _values(file, rows, column) for column in used}
-    periods = {name: period for name, found in values.items() if (period := _period(table, times, name, found))}
+    periods = {
+        name: period
+        for name, found in values.items()
+        if (period := _period(f"{file}: {time.name}", times, name, found))
+    }
     numbers = {m.name: m.frame_id | EFF_FLAG for m in database.messages}
     made = replace(mapping, database=database, sources=sources, protection={}, periods=periods, j1939=False)
     return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
@@ -310,10 +314,10 @@ def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
     return tuple(sources.values())
 
 
-def _period(table: SignalTable, times: Sequence[int], name: str, values: Sequence[float | None]) -> float | None:
+def _period(where: str, times: Sequence[int], name: str, values: Sequence[float | None]) -> float | None:
     """The usual time from one of a column's values to the next [s]; None if there are too few.
 
-    InputError if most share their time with the one before, and the others are far apart.
+    InputError, which begins with `where`, if most share their time with the one before, and the others are far apart.
     """
     known = [time for time, value in zip(times, values, strict=True) if value is not None]
     steps = [after - before for before, after in pairwise(known)]
@@ -323,7 +327,7 @@ def _period(table: SignalTable, times: Sequence[int], name: str, values: Sequenc
     period = median(forward) * 1e-9
     if 2 * len(forward) < len(steps) and period > _COARSEST + 1e-6:
         raise InputError(
-            f"{table.name}: {name!r} mostly has several values at one time, then none for "
+            f"{where}: {name!r} mostly has several values at one time, then none for "
             f"{period:.4g} s: the times are rounded; give them as float64, not float32, or since the start of the ride"
         )
     return period

@@ -99,7 +99,7 @@ def _fitted(
     if free.value(NAMES[2]) <= 0:
         why = f"drag, whose area would be {free.value(NAMES[2]):.2f} m² beside it"
     result.refusals.append(
-        f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m cannot be told from "
+        f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m is indistinguishable from "
         f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"
     )
     return best, covariance, shares

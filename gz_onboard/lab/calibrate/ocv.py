@@ -71,7 +71,7 @@ def _half_gap(sweep: Sweep, result: Result) -> tuple[Sweep, Array]:
     """(`sweep`, its resistance none if it is more than the gap holds; half the gap [V] at the nodes, or nan)."""
     test = sweep.test
     if not np.any(sweep.up):
-        result.notes.append("hysteresis cannot be told without a charge branch")
+        result.notes.append("hysteresis is not identifiable without a charge branch")
         return sweep, np.full(len(SOC), np.nan)
     discharge, charge = (_smooth(sweep.level[part], test.voltage[part], SOC) for part in (sweep.down, sweep.up))
     half: Array = (charge - discharge) / 2

@@ -128,7 +128,7 @@ def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
     every = [calibrate(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
     refused = [found for found in every if found.parameters["rolling_resistance_speed"].value == 0]
     assert len(refused) >= 5  # it is given from 2 sd on: by chance of one in forty
-    assert all("cannot be told from zero" in found.refusals[0] for found in refused)
+    assert all("indistinguishable from zero" in found.refusals[0] for found in refused)
     assert all("·10⁻⁵ s/m" in found.refusals[0] for found in refused)
 
 
