@@ -152,7 +152,7 @@ def mark_of(maker: str) -> str:
     return f"<!-- made by {maker} from here on -->"
 
 
-def drawn(figure: Figure, label: str, colours: int = 64) -> str:
+def drawn(figure: Figure, label: str, colours: int = 20) -> str:
     """A figure inside a page, small, the same bytes for the same figure; label: for those who cannot see it."""
     from PIL import Image
 

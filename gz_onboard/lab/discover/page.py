@@ -106,8 +106,9 @@ def _head(found: Discovery) -> str:
     if (error := report.gain.range) is not None:
         cards.append(("error", f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
     rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
+    named = f": {', '.join(readable(cause.name) for cause in report.causes)}" if report.causes else ""
     return (
-        f"<p>{VERDICTS[report.verdict]}.</p>"
+        f"<p>{VERDICTS[report.verdict]}{named}.</p>"
         f'<p class="about">{rides}; against the vehicle as known from {known}.</p>{tiles(cards)}'
     )
 
