@@ -18,31 +18,20 @@ VERSION = 1
 NO_LONGER_EMPTY = NEARLY_EMPTY + 2.0  # %: an alert that stands goes only here, not at each wobble
 NO_LONGER = 2.0  # K, of a cell that was too hot or too cold: likewise
 
-# Alerts, the most urgent first.
-BUS_DOWN = "bus_down"
-SILENT = "silent"
-PARTLY_SILENT = "partly_silent"
-WAITING = "waiting"
-RANGE_INVALID = "range_invalid"
-UNREACHABLE = "destination_unreachable"
-BATTERY_LOW = "battery_nearly_empty"
-UNCERTAIN = "destination_uncertain"
-SENSORS = "sensor_lost"
-HOT = "cell_too_hot"
-COLD = "cell_too_cold"
 ALERTS = (
-    BUS_DOWN,
-    SILENT,
-    PARTLY_SILENT,
-    WAITING,
-    RANGE_INVALID,
-    HOT,
-    UNREACHABLE,
-    BATTERY_LOW,
-    COLD,
-    UNCERTAIN,
-    SENSORS,
+    "bus_down",
+    "silent",
+    "partly_silent",
+    "waiting",
+    "range_invalid",
+    "cell_too_hot",
+    "destination_unreachable",
+    "battery_nearly_empty",
+    "cell_too_cold",
+    "destination_uncertain",
+    "sensor_lost",
 )
+"""What the rider is told, the most urgent first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,14 +161,14 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     cells = vehicle.cells(now) if vehicle and CELLS not in distrusted else None
     odometer, ridden = vehicle.odometer(now) if vehicle and ODOMETER not in distrusted else (None, None)
     said = {
-        BUS_DOWN: not up,
-        SILENT: len(stale) == len(view.messages),
+        "bus_down": not up,
+        "silent": len(stale) == len(view.messages),
         # Not of one that never came: the first frames may have only just begun.
-        PARTLY_SILENT: len(stale) < len(view.messages) and any(view.messages[name].received for name in stale),
-        WAITING: waiting,
-        RANGE_INVALID: state is State.INVALID and not waiting,
-        BATTERY_LOW: not charging and _low(battery.soc_percent, BATTERY_LOW in before),
-        SENSORS: Reason.SENSOR_DISTRUSTED in reasons or (bool(lost) and not waiting),
+        "partly_silent": len(stale) < len(view.messages) and any(view.messages[name].received for name in stale),
+        "waiting": waiting,
+        "range_invalid": state is State.INVALID and not waiting,
+        "battery_nearly_empty": not charging and _low(battery.soc_percent, "battery_nearly_empty" in before),
+        "sensor_lost": Reason.SENSOR_DISTRUSTED in reasons or (bool(lost) and not waiting),
         **_of_cells(cells, vehicle.limits(charging) if vehicle else None, before),
         **_of_destination(route),
     }
@@ -258,9 +247,12 @@ def _route(view: View, now: float) -> Destination | None:
 def _of_destination(route: Destination | None) -> dict[str, bool]:
     """Whether it cannot be reached, or not surely."""
     if route is None or not route.on_route:
-        return {UNREACHABLE: False, UNCERTAIN: False}
+        return {"destination_unreachable": False, "destination_uncertain": False}
     unreachable = route.battery_ends_after_km is not None or route.arrival_soc_percent == 0
-    return {UNREACHABLE: unreachable, UNCERTAIN: not unreachable and route.arrival_soc_p10_percent == 0}
+    return {
+        "destination_unreachable": unreachable,
+        "destination_uncertain": not unreachable and route.arrival_soc_p10_percent == 0,
+    }
 
 
 def _of_cells(
@@ -268,10 +260,10 @@ def _of_cells(
 ) -> dict[str, bool]:
     """Whether one is hotter or colder [degC] than the limits; an alert that stands goes only some way from them."""
     if cells is None or limits is None:
-        return {HOT: False, COLD: False}
+        return {"cell_too_hot": False, "cell_too_cold": False}
     (coldest, hottest), (low, high) = cells, limits
-    hot = hottest > high - (NO_LONGER * (HOT in before))
-    return {HOT: hot, COLD: coldest < low + (NO_LONGER * (COLD in before))}
+    hot = hottest > high - (NO_LONGER * ("cell_too_hot" in before))
+    return {"cell_too_hot": hot, "cell_too_cold": coldest < low + (NO_LONGER * ("cell_too_cold" in before))}
 
 
 def _low(soc: float | None, stands: bool) -> bool:
