@@ -102,6 +102,7 @@ INSTRUMENTS: dict[str, str] = {
     "coldest_cell_temperature": "degC",
     "hottest_cell_temperature": "degC",
     "bms_temperature": "degC",
+    "vehicle_id": "1",  # a number for each of several vehicles with one file, as from a serial number
     **{f"pack_temperature_{i}": "degC" for i in range(1, 7)},
 }
 

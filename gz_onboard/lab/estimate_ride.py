@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS
+from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS, Codec
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.bus.stamps import without_lone
@@ -28,6 +28,7 @@ from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 TICK_S = TICK_NS * 1e-9
+IDENTIFIED_WITHIN = 60.0  # s from the first frame
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile
 
@@ -126,12 +127,26 @@ def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
     name = source.name if isinstance(source, SignalTable) else source
     mapping, batches = open_ride(source, vehicle, damages.append)
     vehicle = replace(of_ride(vehicle, source), mapping=mapping)
+    vehicle, batches = _identified(vehicle, batches, str(name))
     own = range_publisher(vehicle).may_have_sent
     ours = ([frame for frame in batch if not own(frame)] for batch in batches)
     first = next((batch for batch in ours if batch), None)
     if first is None:
         raise InputError(f"{name}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
     return OpenRide(name, vehicle, first[0][0], chain([first], ours), damages)
+
+
+def _identified(vehicle: Vehicle, batches: Iterator[list[Frame]], where: str) -> tuple[Vehicle, Iterator[list[Frame]]]:
+    """The vehicle whose number the frames show in the first minute, if they show one, and all of the frames."""
+    sources = tuple(source for source in vehicle.mapping.instruments if source.role == "vehicle_id")
+    codec = Codec(replace(vehicle.mapping, sources=sources, requests=()), LONGEST_PAUSE_NS)
+    read: list[list[Frame]] = []
+    while sources and codec.seconds(codec.last_ns) < IDENTIFIED_WITHIN and (batch := next(batches, None)):
+        read.append(batch)
+        for _, _, (value, *_) in codec.decode(batch):
+            if value is not None:
+                vehicle, sources = vehicle.identified(f"{value:.0f}", where), ()
+    return vehicle, chain(read, batches)
 
 
 def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None = None) -> Ridden:

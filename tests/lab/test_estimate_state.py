@@ -27,8 +27,9 @@ from gz_onboard.daemon import keeper
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_order import span_of
+from gz_onboard.lab.estimate_ride import open_estimate
 from gz_onboard.pipeline import TICK_NS
-from gz_onboard.vehicle import find_vehicle
+from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.lab.short_logs import short_log
 from tests.support import S, identifier, recorded, reference, with_cell_voltages
 
@@ -285,6 +286,24 @@ def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
         out, capsys, later, options=["--vehicle-id", "18"]
     )
     assert estimate(out, later, options=["--vehicle-id", "17"]) == 0
+
+
+def test_a_signal_shows_which_vehicle_it_is(short, tmp_path):
+    text = find_vehicle("reference").read_text(encoding="utf-8")
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace("[instruments]\n", '[instruments]\nvehicle_id = "Number"\n'))
+    dbc = tmp_path / "mine.dbc"
+    dbc.write_text('VERSION ""\nBS_:\nBU_: A\nBO_ 1911 SerialNumber: 4 A\n SG_ Number : 0|32@1+ (1,0) [0|0] "" A\n')
+    file.write_text(file.read_text().replace('dbc = ["vehicle.dbc"', 'dbc = ["mine.dbc", "vehicle.dbc"'))
+    frames = [frame for batch in read_frames(short) for frame in batch]
+    begin = frames[0][0]
+    for number, shown in ((17, "-17"), (None, "")):
+        with (log := tmp_path / "numbered.blf").open("wb") as stream:
+            own = [] if number is None else [(begin + S, 1911, number.to_bytes(4, "little"), 0)]
+            write_blf(stream, [sorted([*frames, *own])])
+        ride = open_estimate(log, read_vehicle(file))
+        assert ride.vehicle.name == f"reference-scooter{shown}"
+        assert sum(map(len, ride.batches)) == len(frames) + len(own)
 
 
 def test_what_does_not_go_together(short, tmp_path, capsys):
