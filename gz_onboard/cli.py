@@ -32,7 +32,7 @@ COMMANDS = {
     "learned": ("gz_onboard.daemon.learned", "show what the daemon has learned of battery and riding, or forget it"),
     "route": ("gz_onboard.daemon.route", "give the running daemon the route that is to be ridden, or take it away"),
     "dashboard": ("gz_onboard.dashboard.command", "show the range that the daemon sends, in a terminal or a browser"),
-    "mqtt": ("gz_onboard.bridges.mqtt", "give the range that the daemon sends to an MQTT broker, for Home Assistant"),
+    "mqtt": ("gz_onboard.bridges.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
     "foxglove": ("gz_onboard.bridges.foxglove", "show the range that the daemon sends live in Foxglove"),
     "replay": ("gz_onboard.bus.replay", "send a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
@@ -49,7 +49,7 @@ COMMANDS = {
     "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
     "vehicle": ("gz_onboard.lab.vehicle.command", "begin a vehicle file, or check whether it fits the vehicle's logs"),
     "report": ("gz_onboard.lab.report", "show recorded rides as one self-contained HTML page, also for phones"),
-    "history": ("gz_onboard.lab.history.command", "keep the rides of months in a file, and show what they come to"),
+    "history": ("gz_onboard.lab.history.command", "store rides in a file, and show their totals"),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }
 
@@ -128,7 +128,7 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
     statuses = "\n".join(f"  {status:<4} {text}" for status, text in EXIT_STATUSES.items())
     parser = _Parser(
         prog="gz-onboard",
-        description="Range of an electric scooter, estimated from its CAN bus.",
+        description="Range of an electric scooter from its CAN bus, and what its model gets wrong.",
         epilog=f"exit status:\n{statuses}",
     )
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")

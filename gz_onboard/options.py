@@ -53,7 +53,7 @@ def _jobs(option: str) -> Callable[[str], float]:
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "log": (f"log: {_LOGS}", {"type": Path, "metavar": "LOG"}),
     "logs": (
-        f"logs of rides: {_LOGS}; URLs, patterns, or folders of them, of which CSV files are not read",
+        f"logs of rides: {_LOGS}; URLs, patterns, or folders of them (CSV files in folders are skipped)",
         {"nargs": "+", "type": Path, "metavar": "LOG"},
     ),
     "--vehicle": (
@@ -61,7 +61,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"default": "reference", "metavar": "NAME|TOML"},
     ),
     "--vehicle-id": (
-        "which it is of several vehicles with one file (default: from rides.json beside the log, or the vehicle file)",
+        "ID of this vehicle when several share one file (default: from rides.json beside the log, or the vehicle file)",
         {"metavar": "ID"},
     ),
     "--payload": (

@@ -50,7 +50,7 @@ KEPT = 80, 50, 20, 10  # %: of which charge a copy of the line stays
 REDRAW = 0.1  # s
 LEAST = 3.0  # km ridden, before which the usual gauge shows nothing
 MEANING = {"cornering_drag": "drag of the tyres in bends (cornering_drag)"}
-HEAD = "    battery    ridden    range, 80 % interval     really left    usual gauge"
+HEAD = "    battery    ridden    range, 80 % interval       true left    usual gauge"
 
 
 class Row(NamedTuple):
@@ -155,7 +155,7 @@ def main() -> int:
     Error on average over the ride: range {off(rows, "range"):.1f} km, usual gauge {off(rows, "usual"):.1f} km.
     Picture: {shown(picture)}
 
-2  Discovery. Three recorded rides took more energy than the model says. discover is not told why.
+2  Discovery. Three recorded rides took more energy than the model predicts. discover is given no hint.
 """)
             if discover.wait():
                 raise SystemExit(f"demo: discover failed: {(folder / 'discover.txt').read_text()}")
@@ -195,10 +195,10 @@ def show_range(args: argparse.Namespace) -> list[Row]:
     line = Line(args.ride, sys.stdout, args.terminal)
     print(
         f"""\
-gz_onboard tells the rider of an electric scooter how far it will still go, from its CAN bus. From
+gz_onboard tells the rider of an electric scooter how much farther it can go, from its CAN bus. From
 recorded rides it also finds what the model of the scooter gets wrong.
 
-1  Range. {line.last - line.first:.1f} km from full until the scooter gave up, recorded: what was really left is known.
+1  Range. {line.last - line.first:.1f} km recorded from full until the scooter cut out, so the true distance left is known.
     The usual gauge is the kilometres ridden per percent of battery used, times the percent left.
 
 {HEAD}""",
@@ -230,10 +230,8 @@ def live(args: argparse.Namespace) -> int:
     )
     reach = f"http://{address}/"
     if GUEST.is_dir():
-        where += " in a guest"
-        reach = (
-            f"inside the guest, out of a browser's reach; `make run BUS=virtual` serves it at http://127.0.0.1:{PORT}/"
-        )
+        where += " in a VM"
+        reach = f"not reachable from your browser (it runs in a VM); `make run BUS=virtual` serves it at http://127.0.0.1:{PORT}/"
     print(
         f"""\
     The last {args.seconds:g} s live: the log is replayed to the daemon on {where}.
@@ -304,10 +302,12 @@ def sentence(report: Mapping[str, Any]) -> str:
     cause, gain = report["causes"][0], report["gain"]["range"]
     name, share = MEANING.get(cause["name"], cause["name"].replace("_", " ")), cause["energy_share"]
     low, high = (100 * share * end / cause["value"] for end in cause["ci95"])
+    least, most = (100 * end for end in gain["ci95"])
     return f"""\
     Found: {name}, {100 * share:.1f} % of the energy (95 %: {low:.1f} to {high:.1f}).
-    Error of the model's range on rides it was not fitted to: {100 * gain["before"]:.1f} %; with its parameters
-    refitted {100 * gain["control"]:.1f} %; with what was found {100 * gain["after"]:.1f} %."""
+    Error of the model's range on rides it was not fitted to: {100 * gain["before"]:.1f} %. Refitting known
+    parameters leaves {100 * gain["control"]:.1f} %, the cause {100 * gain["after"]:.1f} %: a gain of {least:.1f} to {most:.1f} points
+    (95 % over the three rides)."""
 
 
 def draw(rows: Sequence[Row], picture: Path) -> None:
@@ -322,7 +322,7 @@ def draw(rows: Sequence[Row], picture: Path) -> None:
     )
     axis.plot(ridden, [row.range for row in rows], color=BLUE, label="range")
     axis.plot(*zip(*usual, strict=True), color=ORANGE, label="usual gauge")
-    axis.plot(ridden, [row.left for row in rows], color=INK, linestyle="--", linewidth=1, label="really left")
+    axis.plot(ridden, [row.left for row in rows], color=INK, linestyle="--", linewidth=1, label="true distance left")
     axis.set_ylim(0, 1.2 * max(row.left for row in rows))
     axis.set_xlim(0, ridden[-1])
     axis.set_xlabel("km ridden", color=INK, fontsize=9, loc="left")

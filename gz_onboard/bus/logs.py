@@ -207,7 +207,7 @@ def _expanded(path: Path) -> list[Path]:
         return [_fetched(f"{url[1]}://{url[2]}")]
     if any(letter in str(path) for letter in "*?[") and not path.exists():
         if not (found := sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))):
-            raise InputError(f"{path}: no file is called so")
+            raise InputError(f"{path}: no files match")
         return found
     return [path]
 

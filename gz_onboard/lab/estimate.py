@@ -173,7 +173,7 @@ def _expected(path: Path) -> int | None:
 def summary_text(ride: RideSummary) -> str:
     """A ride's summary for a terminal."""
     rows = summary_rows(ride)
-    fast = f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride"
+    fast = f"{ride.cpu_s:.2f} s of CPU time, {number(ride.real_time_factor, '.0f')} times real time"
     rows.append(("computed", fast if ride.cpu_s else "by an earlier run"))
     if ride.log:
         rows.append(("written", f"{ride.log}{f' and {Path(ride.plot).suffix}' if ride.plot else ''}"))
@@ -185,8 +185,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
     return [
         (
             "ride",
-            f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, "
-            f"at most {number(ride.speed_max_km_h, '.0f', 'km/h')}",
+            f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, max {number(ride.speed_max_km_h, '.0f', 'km/h')}",
         ),
         *_energy_rows(ride),
         (
@@ -201,7 +200,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         (
             "innovation",
             f"{number(ride.innovation_rms_v, '.1f', 'mV', 1000)} RMS, "
-            f"{number(ride.innovation_max_v, '.0f', 'mV', 1000)} at most, of a cell",
+            f"{number(ride.innovation_max_v, '.0f', 'mV', 1000)} max, per cell",
         ),
         (
             "frames",

@@ -275,7 +275,7 @@ def test_unknown_identifiers(running: Running, listener: Listener, all_frames: b
     assert len(strangers) == (612 if all_frames else 0)
     assert number(summary, r"received (\d+)") == known + (612 if all_frames else 0)
     unknown = daemon.statuses()[-1]["unknown"]
-    assert unknown == ({"7E0": 102, "7E1": 102, "7E2": 102, "200": 306} if all_frames else {})
+    assert unknown == ({"0x7e0": 102, "0x7e1": 102, "0x7e2": 102, "0x00000200": 306} if all_frames else {})
 
 
 def dropped_on_the_way() -> int:

@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--baseline",
         type=Path,
         metavar="OUT.toml",
-        help="the rides are healthy: write the vehicle as they show it, and what healthy rides look "
-        "like beside it; give that file as --vehicle from then on",
+        help="take the rides for healthy: write a baseline vehicle file and the scatter of healthy rides; pass it as "
+        "--vehicle afterwards",
     )
     add_shared(parser, "--payload", help="mass of rider and luggage, of rides that rides.json does not name")
     add_shared(parser, "--report", "--json")
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rides by name that the gain is measured on; each in turn if none is named",
     )
     add_shared(parser, "--effects", help="folder with effects of your own as candidates")
-    parser.add_argument("--list", action="store_true", help="print the candidates and what would show them")
+    parser.add_argument("--list", action="store_true", help="list the candidate causes and the data that each needs")
     jobs = min(2, os.cpu_count() or 1)
     add_shared(parser, "--seed")
     add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")

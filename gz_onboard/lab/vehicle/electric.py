@@ -149,9 +149,9 @@ def check_sag(of: PackRide) -> Iterator[Finding]:
     elif found.correlation > -SAGS:
         yield unknown(check, PACK, f"they hardly go together (correlation {found.correlation:.2f})")
     elif USUAL_RESISTANCES[0] < shown / expected < USUAL_RESISTANCES[1]:
-        yield right(check, PACK, f"the voltage drops with it: {text}")
+        yield right(check, PACK, f"the voltage sags under load: {text}")
     elif RESISTANCES[0] < shown / expected < RESISTANCES[1]:
-        yield unknown(check, PACK, f"the voltage drops with it: {text}; aged or cold cells, r0, or the cells' number")
+        yield unknown(check, PACK, f"the voltage sags under load: {text}; aged or cold cells, r0, or the cells' number")
     else:
         like = unit_of("pack_current", expected / shown) or ": scale of the current, r0, or the cells' number"
         yield wrong(check, ("pack_current",), text + like)
@@ -217,7 +217,7 @@ def _braking(of: PackRide, speed: Array, moving: Mask) -> Iterator[Finding]:
     check, current = "current while braking", of.current
     braking = moving & (rate(np.abs(speed)) < BRAKES)
     if braking.sum() < FEWEST:
-        yield unknown(check, ("pack_current",), "it was hardly braked")
+        yield unknown(check, ("pack_current",), "too little braking")
         return
     size = float(np.nanpercentile(np.abs(current), 90))
     if float(np.percentile(current[braking], 5)) < -0.05 * size:

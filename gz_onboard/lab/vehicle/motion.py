@@ -298,7 +298,7 @@ def check_turning(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     turning = np.where(np.abs(turning) < 1.0, turning, np.nan)
     found = relation(turning, ride["rate_z"], fast)
     if found is None or float(np.nanstd(turning[fast])) < TURNING:
-        yield unknown(check, roles, "hardly a bend was ridden with a course")
+        yield unknown(check, roles, "too few bends with a GPS course")
         return
     text = f"factor {found.factor:.2f}, correlation {found.correlation:.2f}"
     if found.correlation < -CLOSE:
