@@ -193,12 +193,13 @@ def off(rows: Sequence[Row], name: str) -> float:
 def show_range(args: argparse.Namespace) -> list[Row]:
     """Fast until the last seconds of the ride, then live; all that was shown."""
     line = Line(args.ride, sys.stdout, args.terminal)
+    ridden = line.last - line.first
     print(
         f"""\
 gz_onboard tells the rider of an electric scooter how much farther it can go, from its CAN bus. From
 recorded rides it also finds what the model of the scooter gets wrong.
 
-1  Range. {line.last - line.first:.1f} km recorded from full until the scooter cut out, so the true distance left is known.
+1  Range. {ridden:.1f} km recorded from full until the scooter cut out, so the true distance left is known.
     The usual gauge is the kilometres ridden per percent of battery used, times the percent left.
 
 {HEAD}""",
@@ -302,12 +303,12 @@ def sentence(report: Mapping[str, Any]) -> str:
     cause, gain = report["causes"][0], report["gain"]["range"]
     name, share = MEANING.get(cause["name"], cause["name"].replace("_", " ")), cause["energy_share"]
     low, high = (100 * share * end / cause["value"] for end in cause["ci95"])
-    least, most = (100 * end for end in gain["ci95"])
+    before, refitted, after = (f"{100 * gain[name]:.1f} %" for name in ("before", "control", "after"))
+    points = " to ".join(f"{100 * end:.1f}" for end in gain["ci95"])
     return f"""\
     Found: {name}, {100 * share:.1f} % of the energy (95 %: {low:.1f} to {high:.1f}).
-    Error of the model's range on rides it was not fitted to: {100 * gain["before"]:.1f} %. Refitting known
-    parameters leaves {100 * gain["control"]:.1f} %, the cause {100 * gain["after"]:.1f} %: a gain of {least:.1f} to {most:.1f} points
-    (95 % over the three rides)."""
+    Error of the model's range on rides it was not fitted to: {before}. Refitting known parameters
+    leaves {refitted}, adding the cause {after}: a gain of {points} points (95 % over three rides)."""
 
 
 def draw(rows: Sequence[Row], picture: Path) -> None:
