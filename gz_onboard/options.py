@@ -46,15 +46,24 @@ def _json_file(text: str) -> str:
     return text
 
 
+def _log(text: str) -> Path:
+    """The log of this name, or behind this URL."""
+    from gz_onboard.bus.logs import fetched
+
+    if not text:
+        raise InputError("the name of a log is empty")
+    return fetched(text) if "://" in text else Path(text)
+
+
 def _jobs(option: str) -> Callable[[str], float]:
     return number(option, 1, MOST_JOBS, kind=int, counted="processes")
 
 
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "log": (f"log: {_LOGS}", {"type": Path, "metavar": "LOG"}),
+    "log": (f"log: {_LOGS}", {"type": _log, "metavar": "LOG"}),
     "logs": (
         f"logs of rides: {_LOGS}; URLs, patterns, or folders of them (CSV files in folders are skipped)",
-        {"nargs": "+", "type": Path, "metavar": "LOG"},
+        {"nargs": "+", "type": _log, "metavar": "LOG"},
     ),
     "--vehicle": (
         "name of a built-in vehicle, or a vehicle file (default: %(default)s)",

@@ -147,6 +147,9 @@ def test_urls_patterns_and_folders_in_folders_are_logs(folders: Path, capsys: py
     assert f"{url}/none.blf: cannot be fetched: HTTP Error 404" in said
     for argument, told in (
         ("s3://bucket/a.blf", "s3://bucket/a.blf: only http, https and file"),
+        ("http://[::1/a.blf", "http://[::1/a.blf: cannot be fetched"),
+        ("rec/ok***.log", "rec/ok***.log: "),
+        ("", "the name of a log is empty"),
         ("x/*.blf", "no files match"),
     ):
         assert cli.main(["estimate", argument]) == 2

@@ -21,7 +21,7 @@ from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.origins import RECENT, Origins
 from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
-from gz_onboard.events import ERR_FLAG, RTR_FLAG, TRANSMITTED, Event, Frame, Group
+from gz_onboard.events import ERR_FLAG, RTR_FLAG, STALE_PERIODS, TRANSMITTED, Event, Frame, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -47,6 +47,7 @@ DROPPING = (
     MALFORMED,
 )  # that drop a frame or an answer
 
+SILENT = 2.0  # s: a message's own place that sends nothing for so long, and ten periods, has fallen silent
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 AHEAD_NS = 30_000_000_000
 LONGEST_PAUSE_NS = 30 * 86_400 * 1_000_000_000
@@ -85,6 +86,7 @@ class Codec:
         self._suspect_ns = 0  # the time of the last suspect
         self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion
         self.origins = Origins(mapping)
+        self._own_times: dict[str, float] = {}  # s, of the last frame of messages that are heard elsewhere as well
         self._handlers: dict[int, dict[int, Handler]] = {}  # by channel and identifier, of what was heard
         self._channel, self._room = -1, _MOST_IDENTIFIERS  # of the last frame; further handlers to keep
         self._decoders: dict[str, Handler] = {}
@@ -220,18 +222,24 @@ class Codec:
             for other in [i for i in handlers if self._is(message, i) and not self.origins.claim(message, heard, i)]:
                 del handlers[other]
                 self._room += 1
-        decode, recent = self._decoders[message.name], self.origins.recent.get(message.name)
-        if recent is None:
+        decode = self._decoders[message.name]
+        if message.name not in self.origins.recent:
             return decode
 
         def handler(time: float, data: bytes) -> bool | None:
-            recent.append(data)
+            self.origins.own(message.name, data)
+            self._own_times[message.name] = time
             return decode(time, data)
 
         return handler
 
-    def _is(self, message: Message, identifier: int) -> bool:
+    def _is(self, message: Message | None, identifier: int) -> bool:
         return not identifier & (ERR_FLAG | RTR_FLAG) and self.origins.message(identifier) is message
+
+    def heard(self, name: str) -> list[tuple[int, int]]:
+        """(channel, identifier) of all frames of a message that were heard, also where it is not taken from."""
+        message = next((m for m in self.mapping.database.messages if m.name == name), None)
+        return [(channel, i) for channel, known in self._handlers.items() for i in known if self._is(message, i)]
 
     def _elsewhere(self, message: Message, channel: int, identifier: int) -> Handler:
         """The handler of frames that are not from where `message` is taken: left out, or a contradiction."""
@@ -242,14 +250,23 @@ class Codec:
         for heard, handlers in self._handlers.items():  # from now on its own frames are kept, to be compared
             for own in [i for i in handlers if self._is(message, i) and origins.claim(message, heard, i)]:
                 handlers[own] = self._own(message, heard, own)
-                recent += [data for _, data in [self.latest.get(own, (0, b""))]]
+                time_ns, data = self.latest.get(own, (0, b""))
+                recent.append(data)
+                self._own_times[name] = self.seconds(time_ns)
+        stale = max(SILENT, STALE_PERIODS * self.mapping.periods.get(name, 0.0))
 
         def contradicted(_time: float, _data: bytes) -> bool:
             self._fault(name, CONFLICT)
             return True
 
         def handler(time: float, data: bytes) -> bool:
-            if origins.differs(message, channel, identifier, data):
+            silent = time - self._own_times.get(name, time) > stale
+            if silent and origins.take_over(message, channel, identifier):
+                for handlers in self._handlers.values():
+                    for known in [i for i in handlers if self._is(message, i)]:
+                        del handlers[known]
+                return self._count_copy(time, data)
+            if origins.differs(message, channel, identifier, data, silent):
                 for handlers in self._handlers.values():
                     handlers.update({i: contradicted for i in handlers if self._is(message, i)})
                 return contradicted(time, data)

@@ -165,7 +165,7 @@ class _Lenient:
             if syntax[2] == "1" and _UNENDED.fullmatch(self._lines[before]):
                 at = before
             self._leave_out(at, problem)
-        elif wide := re.search(r"Extended frame id .* in message (\w+)", problem):
+        elif wide := re.search(r"(?:Standard|Extended) frame id .* in message (\w+)", problem):
             self._leave_out((_message_line(self._text, wide[1]) or 0) - 1, problem)
         elif unused := re.findall(r"^\s*(VAL_ \d+ \w+)$", problem, re.M):
             for start in unused:

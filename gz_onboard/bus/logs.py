@@ -79,7 +79,6 @@ _FIRST_LINES = {
 _TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
 ESTIMATED = ".estimate.mcap"
 """The end of the name of what ``gz-onboard estimate`` writes."""
-_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.*)")  # a Path has one slash of two
 _HEAD = 8192  # bytes within which a text log shows what it is
 
 
@@ -170,14 +169,19 @@ def _by_content(head: bytes, time: str = "") -> str | None:
     for line in lines:
         if found := next((form for form, first in _FIRST_LINES.items() if first.match(line.strip())), None):
             return found
-    named = time and time in re.split(r"\s*[,;\t]\s*", lines[0].replace('"', "").strip())
+    names = {part for code in ("utf-8", "latin-1") for part in re.split(r"\s*[,;\t]\s*", _first_line(head, code))}
+    named = time and time in names
     return _TABLE if named or _TABLE_HEADER.match(lines[0]) else None
+
+
+def _first_line(head: bytes, code: str) -> str:
+    return str(head, code, "replace").lstrip("\ufeff").partition("\n")[0].replace('"', "").strip()
 
 
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
     """`paths`, with the logs in it and its folders instead of each folder, by name. InputError for one without any.
 
-    A URL is fetched, and a pattern with ``*`` that the shell left is expanded. Of a folder no .csv or .txt, which are
+    A pattern with ``*`` that the shell left is expanded. Of a folder no .csv or .txt, which are
     mostly something else, and nothing that ``gz-onboard estimate`` wrote; or, for `estimates`, these in place of the
     logs that they are of; None: both.
     """
@@ -202,29 +206,32 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
 
 
 def _expanded(path: Path) -> list[Path]:
-    """The file behind a URL, the files that a pattern stands for, or the path itself."""
-    if url := _URL.fullmatch(str(path)):
-        return [_fetched(f"{url[1]}://{url[2]}")]
+    """The files that a pattern stands for, or the path itself."""
     if any(letter in str(path) for letter in "*?[") and not path.exists():
-        if not (found := sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))):
+        try:
+            found = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from None
+        if not found:
             raise InputError(f"{path}: no files match")
         return found
     return [path]
 
 
 @cache
-def _fetched(url: str) -> Path:
-    """The file behind a URL, in a folder that lasts as long as this process."""
+def fetched(url: str) -> Path:
+    """The file behind a URL, in a folder that lasts as long as this process. Raises InputError."""
+    import http.client
     import urllib.request
 
-    if not url.startswith(("http://", "https://", "file://")):
+    if not url.lower().startswith(("http://", "https://", "file://")):
         raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
     folder = TemporaryDirectory(prefix="gz-onboard-")
     atexit.register(folder.cleanup)
     file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
     try:
         urllib.request.urlretrieve(url, file)
-    except OSError as error:
+    except (OSError, ValueError, http.client.HTTPException) as error:
         raise InputError(f"{url}: cannot be fetched: {error}") from None
     return file
 

@@ -154,7 +154,11 @@ def _time_column(table: Table) -> TimeColumn | None:
     time.only(["column", "unit", "format"])
     if ("unit" in time.values) == ("format" in time.values):
         raise time.error("needs either a unit, s or ms, or a format of dates, as of strptime")
-    return TimeColumn(time.text("column"), time.text("unit", "", ["", "s", "ms"]), time.text("format", ""))
+    return TimeColumn(
+        time.text("column"),
+        time.text("unit", "", ["s", "ms"] if "unit" in time.values else []),
+        time.text("format", ""),
+    )
 
 
 def _options(database: Database, messages: Table) -> tuple[dict[str, Protection], dict[str, float], dict[str, float]]:

@@ -20,7 +20,8 @@ class Origins:
     """Finds the message of a frame and takes each message from one place only.
 
     That is the place named by ``channel`` and ``sender`` in the vehicle file; else the sender in the DBC file, once it
-    is heard; else the first place heard. Identical frames from elsewhere are copies, as a gateway makes them.
+    is heard; else the first place heard. Identical frames from elsewhere are copies, as a gateway makes them; they take
+    over where the message's own place falls silent.
     """
 
     def __init__(self, mapping: BusMapping) -> None:
@@ -29,8 +30,12 @@ class Origins:
         self._groups: dict[int, Message] = {}
         self._places: dict[str, Place] = {}
         self.recent: dict[str, deque[bytes]] = {}  # a message's own data, once it is heard elsewhere as well
-        self._pending: dict[tuple[str, Place], bytes] = {}  # what the message's own place has not sent yet
+        self._sent: dict[str, int] = {}  # frames of the message's own place, by message, once it is heard elsewhere
+        self._pending: dict[
+            tuple[str, Place], tuple[int, bytes | None]
+        ] = {}  # their number at a frame, and its data if new
         self._apart: dict[tuple[str, Place], int] = {}  # frames in a row
+        self._copies: set[tuple[str, Place]] = set()  # places that sent the same while the message's own did
         self.conflicts: dict[str, str] = {}  # what differs and what to do, by message
         for message in mapping.database.messages:
             if mapping.j1939 and message.is_extended_frame:
@@ -52,21 +57,39 @@ class Origins:
             self._places[message.name] = now = place
         return place == now
 
-    def differs(self, message: Message, channel: int, identifier: int, data: bytes) -> bool:
-        """Whether frames from elsewhere contradict `message`; `data` is the last of them."""
+    def own(self, name: str, data: bytes) -> None:
+        """Note a frame of the message of this name from its own place, to compare others with."""
+        self.recent[name].append(data)
+        self._sent[name] = self._sent.get(name, 0) + 1
+
+    def take_over(self, message: Message, channel: int, identifier: int) -> bool:
+        """Take `message` from here, if frames from here were copies of it; gives whether it is."""
+        place = self._place(message, channel, identifier)
+        if (message.name, place) in self._copies and message.name not in self.conflicts:
+            self._places[message.name] = place
+        return self._places.get(message.name) == place
+
+    def differs(self, message: Message, channel: int, identifier: int, data: bytes, silent: bool = False) -> bool:
+        """Whether frames from elsewhere contradict `message`; `data` is the last of them. silent: its own place is."""
         place, own = self._place(message, channel, identifier), self._places.get(message.name)
         if own is None or not self._may_be(message, place) or (self._is_in_dbc(message, own) and place[1] != own[1]):
             return False  # it is known which is meant
         at, recent = (message.name, place), self.recent.setdefault(message.name, deque(maxlen=RECENT))
-        pending = self._pending.pop(at, None)
-        if data in recent:
+        sent, pending = self._pending.get(at, (self._sent.get(message.name, 0), None))
+        now = self._sent.get(message.name, 0)
+        if silent:
+            self._apart[at] = self._apart.get(at, 0) + 1
+        elif data in recent:
             self._apart[at] = 0
-        else:
-            self._pending[at] = data
-            if pending is not None:
-                self._apart[at] = 0 if pending in recent else self._apart.get(at, 0) + 1
+            if now > sent:
+                self._copies.add(at)
+        elif pending is not None and now > sent:
+            self._apart[at] = 0 if pending in recent else self._apart.get(at, 0) + 1
+        self._pending[at] = now, None if data in recent else data
         if self._apart.get(at, 0) >= RECENT:
-            self.conflicts[message.name] = _conflict(message, own, place)
+            self.conflicts[message.name] = _conflict(
+                message, own, place, "one after the other" if silent else "with different data"
+            )
         return message.name in self.conflicts
 
     def _place(self, message: Message, channel: int, identifier: int) -> Place:
@@ -83,11 +106,11 @@ class Origins:
         return self._wanted.get(message.name, (None, None))[1] is None and place[1] == message.frame_id & 0xFF
 
 
-def _conflict(message: Message, own: Place, other: Place) -> str:
+def _conflict(message: Message, own: Place, other: Place, how: str) -> str:
     if own[0] != other[0]:
         identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
         said, key = f"{hexadecimal(identifier)} comes on channels {own[0]} and {other[0]}", f"channel = {own[0]}"
     else:
         said = f"parameter group {pgn(message.frame_id):#x} comes from senders {own[1]:#x} and {other[1]:#x}"
         key = f"sender = {own[1]:#x}"
-    return f"{said} with different data ({message.name}): say which is meant, {key} under [bus.messages.{message.name}]"
+    return f"{said} {how} ({message.name}): say which is meant, {key} under [bus.messages.{message.name}]"

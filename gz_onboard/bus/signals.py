@@ -87,8 +87,8 @@ class Decoder:
                 origins.differs(message, channel, identifier, data)
                 return False
             self._own.add(place)
-        if recent := origins.recent.get(message.name):
-            recent.append(data)
+        if message.name in origins.recent:
+            origins.own(message.name, data)
         return True
 
     def _row(self, message: Message, values: Values) -> Values:

@@ -163,6 +163,9 @@ def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
         f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames"
         f"{f' (identifiers {names}, ...)' if names else ''}; "
     )
+    for message in vehicle.mapping.database.messages:
+        for channel, identifier in codec.heard(message.name):
+            return InputError(f"{said}{message.name} came on channel {channel} as {hexadecimal(identifier)}: see [bus]")
     for identifier in codec.unknown:
         if codec.origins.message(other := identifier ^ EFF_FLAG):
             bits, others = (29, 11) if identifier & EFF_FLAG else (11, 29)
@@ -179,13 +182,16 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
         return {}
     found: dict[str, dict[str, object]] = {}
     try:
-        for row in json.loads(file.read_text(encoding="utf-8")):
+        rows = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(rows, list) or not all(isinstance(r, dict) and isinstance(r.get("name"), str) for r in rows):
+            raise InputError(f"{file}: must be a JSON list of objects, each with a name, that of its log")
+        for row in rows:
             name = row.pop("name")
             if name in found:
                 raise InputError(f"{file}: two rides are called {name!r}")
             found[name] = checked_facts(f"{file}: {name}", row)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: must be a JSON list of objects with a name: {error}") from error
     return found
 
 
@@ -233,7 +239,8 @@ def ride_name(log: Path) -> str:
 
 def facts_of(log: Path) -> dict[str, object]:
     """What ``rides.json`` beside a log says about its ride."""
-    return read_facts(log.parent / "rides.json").get(ride_name(log), {})
+    facts = read_facts(log.parent / "rides.json")
+    return facts.get(ride_name(log)) or facts.get(log.name, {})
 
 
 def of_ride(vehicle: Vehicle, source: Path | SignalTable) -> Vehicle:

@@ -160,6 +160,8 @@ def _time_column(file: Path, header: Sequence[str], told: TimeColumn | None) -> 
                 f"{file}:1: there is no column {shown(told.name)}, which is the time in the vehicle file"
                 f"{nearest(told.name, names)}"
             )
+        if names.count(told.name) > 1:
+            raise InputError(f"{file}:1: two columns are called {told.name!r}")
         return names.index(told.name), told
     for at, name in enumerate(names):
         if found := _TIME.fullmatch(name):
@@ -186,7 +188,7 @@ def _times(file: Path, column: TimeColumn, rows: Sequence[tuple[int, Any]]) -> l
     times: list[int] = []
     for line, cell in rows:
         try:
-            times.append(_nanoseconds(datetime.strptime(cell.strip(), column.format) if column.format else cell, unit))
+            times.append(_nanoseconds(_dated(cell, column.format), unit))
         except KeyError:
             raise InputError(
                 f"{file}:{line}: {name}: {shown(cell)} has no unit; call the column 'time [s]' or 'time [ms]'"
@@ -212,6 +214,11 @@ def _times(file: Path, column: TimeColumn, rows: Sequence[tuple[int, Any]]) -> l
             "the times are in ms, call the column 'time [ms]'"
         )
     return [time - times[0] for time in times] if times[0] < 0 else times
+
+
+def _dated(cell: object, form: str) -> object:
+    """A text of this `form` as its date; what is a date already, or without a form, as it is."""
+    return datetime.strptime(str(cell).strip(), form) if form and not isinstance(cell, date) else cell
 
 
 def _nanoseconds(cell: object, unit: str) -> int:

@@ -494,6 +494,28 @@ def test_one_identifier_with_two_meanings_is_dropped_and_named(tmp_path):
     )
 
 
+def on_one_bus(channel: int, volts: list[int], first: int) -> list[Frame]:
+    return [((first + i) * 100 * MS, 256, v.to_bytes(2, "little") + bytes(6), channel) for i, v in enumerate(volts)]
+
+
+def test_copies_take_over_where_the_first_place_falls_silent(tmp_path):
+    codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
+    events = codec.decode(on_two_buses([(3600 + i, 3600 + i) for i in range(20)]))
+    events += codec.decode(on_one_bus(1, [3700 + i for i in range(100)], 20))
+    assert not codec.origins.conflicts and not codec.faults
+    assert len(events) >= 20 + 100 - 22  # two seconds until the silence is one
+    assert events[-1][2][0] == pytest.approx(379.9)
+
+
+@pytest.mark.parametrize("volts", [[3600, 3601] * 60, [120 + i for i in range(120)]])
+def test_what_goes_on_elsewhere_and_was_never_a_copy_is_refused(tmp_path, volts):
+    codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
+    codec.decode(on_one_bus(0, [3600, 3601] * 60, 0))
+    assert codec.decode(on_one_bus(1, volts, 120)) == []
+    assert "0x100 comes on channels 0 and 1" in codec.origins.conflicts["Pack"]
+    assert codec.heard("Pack") == [(0, 256), (1, 256)]
+
+
 @pytest.mark.parametrize("key", ["channel = 1\n", "\n[bus.messages.Pack]\nchannel = 1\n"])
 def test_the_vehicle_file_says_on_which_channel_a_message_is(tmp_path, key):
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"', key))

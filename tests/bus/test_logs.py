@@ -77,7 +77,11 @@ def messages(draw: st.DrawFn, fd: bool, errors: bool = True) -> list[can.Message
 
 def by_python_can(path: Path) -> list[Frame]:
     channels = ChannelNumbers()
-    return [frame_of(message, channels) for message in can.LogReader(path)]
+    messages = list(can.LogReader(path))
+    for message in messages:
+        if path.suffix == ".trc":  # PCAN counts its buses from 1
+            message.channel = int(str(message.channel)) - 1
+    return [frame_of(message, channels) for message in messages]
 
 
 def same(ours: list[Frame], theirs: list[Frame], within_ns: int) -> bool:
@@ -643,6 +647,20 @@ def test_a_damaged_first_chunk_loses_only_its_own_frames_and_samples(tmp_path: P
     (tmp_path / "b.mcap").write_bytes(data)
     assert 0 < len(list(read_samples(tmp_path / "b.mcap"))) < before
     assert set(json_channels(tmp_path / "b.mcap")) == {"/estimate"}
+
+
+@pytest.mark.parametrize(("at", "mask"), [(-9, 0x03), (7, 0x40)], ids=["opcode", "start time"])
+def test_a_chunk_whose_head_is_damaged_is_told_or_read(tmp_path: Path, at: int, mask: int) -> None:
+    path = tmp_path / "a.mcap"
+    frames = three_chunks(path)
+    data = bytearray(path.read_bytes())
+    data[chunk_at(data, 1) + at] ^= mask
+    path.write_bytes(data)
+    there, damages = read(path)
+    assert there == frames or [damage.count for damage in damages] == [1]
+    end_ns = frames[-1][0] + 1
+    part = [frame for batch in read_frames(path, frames[0][0], end_ns, damages.append) for frame in batch]
+    assert part == there
 
 
 BOMB = """

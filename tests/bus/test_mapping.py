@@ -339,6 +339,7 @@ def test_a_broken_dbc(tmp_path, change, parts):
             "line 5: signal Current is a float of 16",
         ),
         (("BO_ 256 Pack", "BO_ 3221225728 Pack"), {"Pack.*"}, "line 5: Extended frame id 0x40000100 is more than 29"),
+        (("BO_ 256 Pack", "BO_ 1610612992 Pack"), {"Pack.*"}, "line 5: Standard frame id 0x60000100 is more than 11"),
         (("BO_ 256 Pack", "BO_ 256 2Pack"), {"2Pack.*"}, "line 5: Invalid syntax"),
         (("0|16@1- (1", "100000|16@1- (1"), {"Motor.Speed"}, "line 13: .*beyond the longest frame"),
         (("BO_ 257", 'CM_ "no end"\nBO_ 257'), set(), "line 12: Invalid syntax"),

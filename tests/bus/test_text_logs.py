@@ -209,8 +209,8 @@ PCAN_1_2 = (
 def test_pcan_traces_of_version_1_2_are_read(tmp_path):
     noon_ns = 1_678_881_600 * S  # 2023-03-15 12:00 UTC
     assert frames_of(tmp_path, PCAN_1_2, "ride.trc") == [
-        (noon_ns + 12_345_000, 0x100, b"\x10\x0e", 1),
-        (noon_ns + 512_345_000, 0x18FF50E5 | EFF_FLAG, b"\x90", 1 | TRANSMITTED),
+        (noon_ns + 12_345_000, 0x100, b"\x10\x0e", 0),
+        (noon_ns + 512_345_000, 0x18FF50E5 | EFF_FLAG, b"\x90", TRANSMITTED),
     ]
 
 

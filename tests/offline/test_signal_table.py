@@ -367,6 +367,31 @@ def test_a_column_of_times_that_is_not_there_or_has_no_unit_is_refused(tmp_path,
         read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n"))
 
 
+@pytest.mark.parametrize("dates", [["06/13/2017 7:47:00", None], [1, 2]])
+def test_dates_of_parquet_are_those_of_the_format_or_refused(tmp_path, without_dbc, dates):
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    form = '[table]\ntime = { column = "when", format = "%m/%d/%Y %H:%M:%S" }\n'
+    vehicle = other_vehicle(without_dbc, '\npack_voltage = { signal = "U", unit = "V" }\n', form)
+    pq.write_table(pa.table({"when": dates, "U": [50.0, 51.0]}), tmp_path / "ride.parquet")
+    with pytest.raises(InputError, match=r"ride.parquet:\d: when: .* is no date of the format"):
+        read_samples(tmp_path / "ride.parquet", vehicle)
+    moments = pa.array([10**9, 2 * 10**9], pa.timestamp("ns", "UTC"))
+    pq.write_table(pa.table({"when": moments, "U": [50.0, 51.0]}), tmp_path / "ride.parquet")
+    assert set(read_samples(tmp_path / "ride.parquet", vehicle).columns) == {"pack_voltage"}
+
+
+def test_a_column_of_times_may_have_any_letters_and_is_there_once(tmp_path, without_dbc):
+    table = '[table]\ntime = { column = "Zeit für", unit = "s" }\n'
+    vehicle = other_vehicle(without_dbc, '\npack_voltage = { signal = "U", unit = "V" }\n', table)
+    (tmp_path / "ride.csv").write_text("U,Zeit für\n50,1\n51,2\n", encoding="utf-8")
+    assert set(read_samples(tmp_path / "ride.csv", vehicle).columns) == {"pack_voltage"}
+    (tmp_path / "ride.csv").write_text("U,Zeit für,Zeit für\n50,1,7\n51,2,8\n", encoding="utf-8")
+    with pytest.raises(InputError, match="two columns are called 'Zeit für'"):
+        read_samples(tmp_path / "ride.csv", vehicle)
+
+
 def test_a_table_whose_time_no_one_names_says_how_to(tmp_path, without_dbc):
     (tmp_path / "trip.csv").write_text(OTHERS)
     with pytest.raises(InputError, match=r"\[table\] time = \{ column"):

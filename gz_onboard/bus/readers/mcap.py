@@ -24,6 +24,7 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
 CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
 _FOOTER = struct.Struct("<BQQQL")  # opcode, length, start of the summary and of its offsets, CRC
+_CHUNK_COUNT = 22  # where it stands in the statistics
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
@@ -38,10 +39,13 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
     """The raw frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
     channels: set[int] = set()
     topics: set[str] = set()
+    promised, chunks = 0, 0
     for opcode, position, _ in _declared(data):
         with contextlib.suppress(*BROKEN):
             if opcode == Opcode.CHANNEL:
                 _channel(data, position, channels, topics)
+            elif opcode == Opcode.STATISTICS:
+                promised = _U32.unpack_from(data, position + _CHUNK_COUNT)[0]
     for opcode, position, limit in records(path, data, damage):
         blocks = []
         try:
@@ -51,7 +55,8 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
                 first, last, _, _, _ = CHUNK.unpack_from(data, position)
                 # Where there is no summary, the first chunk declares the channels.
                 wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
-                if not wanted and channels:
+                chunks += 1
+                if not wanted and channels and first <= last:
                     continue
                 content = unpack_chunk(data, position, limit)
                 for inner, at, until in records_in(content):
@@ -67,6 +72,8 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
                 yield framelog.decode_block(block)
             except ValueError as error:
                 damage.add(f"byte {position}", f"a block of frames is broken ({error})")
+    if chunks < promised and not damage.count:
+        damage.add("in the middle", f"{promised - chunks} of {promised} chunks are missing", promised - chunks)
     if not channels and topics:
         raise InputError(
             f"{path}: no raw frames in this MCAP file: it has no topic {framelog.TOPIC} in the encoding"
@@ -185,7 +192,7 @@ def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, i
 
 
 def _declared(data: Contents) -> list[tuple[int, int, int]]:
-    """Opcode, start and end of the schemas and channels in the summary; none without a summary.
+    """Opcode, start and end of the schemas, channels and statistics in the summary; none without a summary.
 
     The chunk that declares them may be broken.
     """
@@ -200,7 +207,7 @@ def _declared(data: Contents) -> list[tuple[int, int, int]]:
         found = [(kind, start + at, start + until) for kind, at, until in records_in(data[start:footer])]
     except BROKEN:
         return []
-    return [record for record in found if record[0] in (Opcode.SCHEMA, Opcode.CHANNEL)]
+    return [record for record in found if record[0] in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)]
 
 
 def _next_chunk(data: Contents, position: int) -> int:

@@ -112,6 +112,8 @@ def text_reader(suffix: str) -> Reader:
                 length = _length(message, suffix)
                 if len(message.data) != length and not (message.is_remote_frame or message.is_error_frame):
                     raise ValueError(f"{len(message.data)} bytes of data where there should be {length}")
+                if suffix == ".trc" and isinstance(message.channel, int):
+                    message.channel = max(message.channel - 1, 0)  # PCAN counts its buses from 1
                 batch.append(frame_of(message, channels))
             # python-can's readers have no error of their own: these are what a line that is none raises in them.
             except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:

@@ -135,6 +135,8 @@ def _alike(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:
     message = next((m for m in codec.mapping.database.messages if m.name == source.message), None)
     if message is None:
         return ""
+    for channel, identifier in codec.heard(message.name):
+        return f"; {message.name} came on channel {channel} as {hexadecimal(identifier)}: see [bus] of the vehicle file"
     wanted = hexadecimal(identifier_of(message))
     digits = {one: sum(a != b for a, b in zip(hexadecimal(one), wanted, strict=False)) for one in codec.unknown}
     found = [one for one in digits if lengths.get(one) == message.length and len(hexadecimal(one)) == len(wanted)]
