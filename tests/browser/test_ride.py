@@ -87,5 +87,5 @@ def test_the_page_shows_the_frames_of_a_ride(page, tmp_path):
             return shown != "–" and near(shown, energy)
 
         wait_for(newest, "the newest energy on the page")
-    shows(page, range_value="–", alerts="The dashboard does not answer. Trying again.")
+    shows(page, range_value="–", alerts="Dashboard not responding. Trying again.")
     assert numbers(page) == []

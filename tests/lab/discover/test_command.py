@@ -111,7 +111,7 @@ def test_one_healthy_ride(alone: Path):
 
 def test_the_report_is_one_file_with_its_pictures(alone: Path):
     page = (alone / "out.html").read_text()
-    assert page.count("data:image/png;base64,") >= 3
+    assert page.count("data:image/webp;base64,") >= 3
     assert 'src="http' not in page
 
 
