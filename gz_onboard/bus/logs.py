@@ -190,7 +190,7 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
         if not path.is_dir():
             logs.append(path)
             continue
-        files = sorted(file for file in path.rglob("*") if file.is_file() and not _is_hidden(file.relative_to(path)))
+        files = sorted(file for file in path.rglob("*") if file.is_file() and "/." not in f"/{file.relative_to(path)}")
         found = [file for file in files if _is_log(file, estimates)]
         if estimates:
             made = {
@@ -234,10 +234,6 @@ def fetched(url: str) -> Path:
     except (OSError, ValueError, http.client.HTTPException) as error:
         raise InputError(f"{url}: cannot be fetched: {error}") from None
     return file
-
-
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
 
 
 def log_stem(log: Path) -> str:

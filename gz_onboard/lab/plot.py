@@ -158,17 +158,13 @@ def _band(axis: Axes, x: Sequence[float], middle: Sequence[float], sd: Sequence[
     axis.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0, label=text)
 
 
-def _finite(*columns: Sequence[float]) -> list[float]:
-    return [value for column in columns for value in column if isfinite(value)]
-
-
 def _range(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     p10, p90 = column(rows, "range_p10", 1e-3), column(rows, "range_p90", 1e-3)
     naive = [_NAN if value is None else value / 1000 for value in naive_range(rows)]
     axis.fill_between(x, p10, p90, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
     axis.plot(x, naive, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)), label="by the last 25 km's Wh/km alone")
     axis.plot(x, column(rows, "range", 1e-3), color=BLUE, linewidth=1.8, label="range")
-    top = max(_finite(p90), default=1.0)
+    top = max(filter(isfinite, p90), default=1.0)
     axis.set_ylim(0, top * 1.12)  # the naive one may be anything: it does not set the scale
     ordinate(axis, "range [km]", BLUE)
     legend(axis)

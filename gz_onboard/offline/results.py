@@ -14,7 +14,6 @@ from gz_onboard.offline.schema import to_json
 
 FIRST_DATE_NS = 946_684_800_000_000_000
 """A log before 2000 has no date [ns since the epoch]: its clock was not set."""
-_WIDTH = 110  # of a line in a terminal
 
 # --- JSON ---------------------------------------------------------------------------------------------------------
 

@@ -131,10 +131,6 @@ class Parameters(Mapping[str, float]):
         """The value of `name` before others were entered: that of the vehicle file."""
         return self._replaced.get(name, self[name])
 
-    def is_entered(self, name: str) -> bool:
-        """Whether the value of `name` was entered, be it the vehicle file's own."""
-        return name in self._replaced
-
     def covariance(self, names: Sequence[str]) -> list[list[float]]:
         """The covariance of the parameters `names`, in the products of their units."""
         sds = [self.known[name].sd for name in names]

@@ -67,14 +67,6 @@ def _told(maps: Maps) -> str:
     return "  ·  ".join(parts)
 
 
-def _in_rpm(speed: Any) -> Any:
-    return speed * _RPM
-
-
-def _of_rpm(speed: Any) -> Any:
-    return speed / _RPM
-
-
 def _label(axis: Axes, maps: Maps, shares: Array) -> None:
     """Numbers at the contours, above and below the torques where they run together."""
     apart = _APART * float(maps.torque[-1])
@@ -112,7 +104,7 @@ def _draw(axis: Axes, maps: Maps, part: str, norm: Any) -> Any:
             linewidths=0.6,
             zorder=3,
         )
-    top = axis.secondary_xaxis("top", functions=(_in_rpm, _of_rpm))
+    top = axis.secondary_xaxis("top", functions=(lambda x: np.multiply(x, _RPM), lambda x: np.multiply(x, 1 / _RPM)))
     top.set_xlabel("[r/min]", fontsize=7.5, color=MUTED, loc="right", labelpad=2)
     top.tick_params(labelsize=7.5, length=0, colors=MUTED)
     top.spines["top"].set_color(GRID)
