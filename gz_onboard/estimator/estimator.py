@@ -25,7 +25,7 @@ from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
 from gz_onboard.estimator.route_ahead import RoadAhead
-from gz_onboard.estimator.signals import DEFAULT_STALE, LEAPS, Signals, Told
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signals, Told
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
@@ -86,7 +86,8 @@ class Estimator:
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None
         self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._vibration else -1
         self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
-        self._telling = set(_carrying(tuple(LEAPS), groups))
+        told = {i: [(at, s) for at, s in enumerate(self._slots[i]) if isinstance(s, Told)] for i in range(len(groups))}
+        self._told = {i: own for i, own in told.items() if own or i == self._shaken}
         self.signals.told[SHOWN].nothing = battery.window.of_cells(0.0)
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
@@ -128,27 +129,27 @@ class Estimator:
         self._last_seen[group] = time
         if gap > SLOW_GAP or self._gaps[group]:
             self._timing.watch(group, gap)
-        if group in self._telling:
-            values = self._plausible(time, group, values)
+        if group in self._told:
+            values = self._look_at(time, group, values)
         for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
             if value is not None:
                 signal.value = value
                 signal.time = time
                 signal.total += value
                 signal.count += 1
-        if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
-            self._vibration.update(time, accel_z)
         if group == self._pace or time >= self._deadline:
             if group != self._pace and self._await_pace(time):
                 return
             self._step(time)
 
-    def _plausible(self, time: float, group: int, values: Sequence[float | None]) -> tuple[float | None, ...]:
+    def _look_at(self, time: float, group: int, values: tuple[float | None, ...]) -> tuple[float | None, ...]:
         """`values` less what of the vehicle's own leaps; its state of charge becomes that of the cells."""
+        if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
+            self._vibration.update(time, accel_z)
         plausible = list(values)
-        for i, signal in enumerate(self._slots[group]):
+        for i, signal in self._told[group]:
             value = values[i]
-            if isinstance(signal, Told) and value is not None:
+            if value is not None:
                 value = self.battery.window.of_cells(value) if signal.role == SHOWN else value
                 plausible[i] = value if signal.believes(value, time) else None
         return tuple(plausible)

@@ -46,7 +46,9 @@ class Signal:
 
     def mean(self, now: float) -> float | None:
         """Its mean since the last step; if nothing came, its last value; None if that is stale or not trusted."""
-        return self.reported(now) if self.trusted else None
+        if not self.trusted or now - self.time > self.stale_after:  # `reported`, without the call
+            return None
+        return self.total / self.count if self.count else self.value
 
     def reported(self, now: float) -> float | None:
         """What `mean` gives, trusted or not."""

@@ -260,16 +260,16 @@ class StateOfCharge:
         before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         self.ageing.count(filter_, before, mean * dt / charge)
-        filter_.covariance = limited(filter_.covariance)
+        if filter_.covariance[0] > SOC_UNKNOWN_SD**2:
+            filter_.covariance = limited(filter_.covariance)
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
 
     def _shows_nothing(self, now: float, dt: float, reading: PackReading) -> bool:
         """Whether the current has read exactly 0 for long: many sensors show small currents, as of what is on, so."""
-        shown, closed = self._signals.pack_current, self._signals.contactor.get(now) != 0
-        nothing = reading.source is CurrentSource.PACK and shown.value == 0.0 and closed
-        self._nothing = self._nothing + dt if nothing else 0.0
+        nothing = reading.source is CurrentSource.PACK and self._signals.pack_current.value == 0.0
+        self._nothing = self._nothing + dt if nothing and self._signals.contactor.get(now) != 0 else 0.0
         return self._nothing > NOTHING_FOR
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:

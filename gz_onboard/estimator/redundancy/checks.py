@@ -46,7 +46,8 @@ class FaultCounter:
             self.contradicted = min(self.contradicted + dt, FAULTY_AFTER)
             self.faulty |= self.contradicted >= FAULTY_AFTER - ROUNDING
         elif contradicts is not None:
-            self.contradicted = max(self.contradicted - AGREEMENT_WEIGHT * dt, 0.0)
+            if self.contradicted:
+                self.contradicted = max(self.contradicted - AGREEMENT_WEIGHT * dt, 0.0)
             self.agreed += dt
             if self.agreed >= RECOVERED_AFTER:
                 self.faulty = False
