@@ -44,7 +44,7 @@ def completion(shell: str) -> str:
     """The script that completes the command line in ``bash`` or ``zsh``; where a file is wanted, by files."""
     parser = command_line(COMMANDS)
     for action in actions_of(parser):
-        if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT"):
+        if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT", "LOG"):
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         if {"--kind", "--cells"} & set(action.option_strings):
             action.choices = VALUES[str(action.metavar)]

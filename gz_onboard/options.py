@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gz_onboard.errors import InputError
@@ -48,11 +51,27 @@ def _json_file(text: str) -> str:
 
 def _log(text: str) -> Path:
     """The log of this name, or behind this URL."""
-    from gz_onboard.bus.logs import fetched
-
     if not text:
         raise InputError("the name of a log is empty")
-    return fetched(text) if "://" in text else Path(text)
+    return _fetched(text) if "://" in text else Path(text)
+
+
+@cache
+def _fetched(url: str) -> Path:
+    """The file behind a URL, in a folder that lasts as long as this process. Raises InputError."""
+    import http.client
+    import urllib.request
+
+    if not url.lower().startswith(("http://", "https://", "file://")):
+        raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
+    folder = TemporaryDirectory(prefix="gz-onboard-")
+    atexit.register(folder.cleanup)
+    file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
+    try:
+        urllib.request.urlretrieve(url, file)
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        raise InputError(f"{url}: cannot be fetched: {error}") from None
+    return file
 
 
 def _jobs(option: str) -> Callable[[str], float]:

@@ -11,7 +11,6 @@ CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
 
 from __future__ import annotations
 
-import atexit
 import json
 import logging
 import mmap
@@ -20,10 +19,8 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
@@ -216,24 +213,6 @@ def _expanded(path: Path) -> list[Path]:
             raise InputError(f"{path}: no files match")
         return found
     return [path]
-
-
-@cache
-def fetched(url: str) -> Path:
-    """The file behind a URL, in a folder that lasts as long as this process. Raises InputError."""
-    import http.client
-    import urllib.request
-
-    if not url.lower().startswith(("http://", "https://", "file://")):
-        raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
-    folder = TemporaryDirectory(prefix="gz-onboard-")
-    atexit.register(folder.cleanup)
-    file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
-    try:
-        urllib.request.urlretrieve(url, file)
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise InputError(f"{url}: cannot be fetched: {error}") from None
-    return file
 
 
 def log_stem(log: Path) -> str:
