@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import atexit
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from gz_onboard.errors import InputError
@@ -59,12 +57,14 @@ def _log(text: str) -> Path:
 @cache
 def _fetched(url: str) -> Path:
     """The file behind a URL, in a folder that lasts as long as this process. Raises InputError."""
+    import atexit
     import http.client
+    import tempfile
     import urllib.request
 
     if not url.lower().startswith(("http://", "https://", "file://")):
         raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
-    folder = TemporaryDirectory(prefix="gz-onboard-")
+    folder = tempfile.TemporaryDirectory(prefix="gz-onboard-")
     atexit.register(folder.cleanup)
     file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
     try:
