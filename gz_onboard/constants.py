@@ -7,5 +7,6 @@ THERMAL_VOLTAGE = 8.617333e-5  # V/K: gas constant over Faraday's
 WH = HOUR  # J
 WH_PER_KM = 3.6  # J/m
 
+EARTH_RADIUS = 6_371_000.0  # m, mean
 BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
 MILD = 20.0  # degC: of a vehicle and of the air where nothing else is known

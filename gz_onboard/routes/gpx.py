@@ -12,13 +12,13 @@ from math import cos, hypot, nan, radians
 from pathlib import Path
 from xml.parsers import expat
 
+from gz_onboard.constants import EARTH_RADIUS
 from gz_onboard.errors import InputError, shown, unreadable
 from gz_onboard.routes.columns import LEAST_ROWS, Columns, read_columns
 
 POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
 PARTS = ("trk", "trkseg", "rte")
 JOINED = 100.0  # m from the end of a part to the begin of the next, which is the same road
-EARTH = 6_371_000.0  # m, its radius
 Point = tuple[int, str, str, str]
 """(line, latitude, longitude, altitude) as they stand in the file; an altitude may be empty."""
 
@@ -107,7 +107,7 @@ def _check_joined(file: Path, parts: list[list[Point]]) -> None:
     for before, after in pairwise(parts):
         (south, west), (north, east) = ((float(p[1]), float(p[2])) for p in (before[-1], after[0]))
         across = ((east - west + 180) % 360 - 180) * cos(radians((south + north) / 2))
-        gap = EARTH * radians(hypot(north - south, across))
+        gap = EARTH_RADIUS * radians(hypot(north - south, across))
         if gap > JOINED:
             many = f"has {len(parts)} tracks or segments, which do not join: {gap / 1000:.1f} km lie before this one"
             raise InputError(f"{file}:{after[0][0]}: {many}; keep the one that is the road")

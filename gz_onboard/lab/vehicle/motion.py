@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import EARTH_RADIUS, GRAVITY
 from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.estimator.redundancy.odometer import APART as ODOMETER_APART
 from gz_onboard.estimator.redundancy.odometer import FASTEST
@@ -21,7 +21,6 @@ from gz_onboard.vehicle import Vehicle
 ROLLING = AXLE | {"wheel_speed_front"}  # their speed is by the radius
 BENCH = "a roller bench"
 SIGN = "speed's sign"
-EARTH = 6_371_000.0  # m, its radius
 SHORTEST = 300.0  # m, over which two distances are compared
 STRETCH = 10  # s, over which positions are compared with a speed
 FEW = 5  # stretches at least
@@ -105,8 +104,8 @@ def _speed_verdicts(
 
 def _steps(latitude: Array, longitude: Array, moving: Mask) -> Array:
     """The way [m] (n - 1,) from each position [deg] to the next, 0 where it is not `moving` (n,)."""
-    north = np.radians(np.diff(latitude)) * EARTH
-    east = np.radians(np.diff(longitude)) * EARTH * np.cos(np.radians(latitude[:-1]))
+    north = np.radians(np.diff(latitude)) * EARTH_RADIUS
+    east = np.radians(np.diff(longitude)) * EARTH_RADIUS * np.cos(np.radians(latitude[:-1]))
     return np.where(moving[:-1] & moving[1:], np.hypot(north, east), 0.0)
 
 
