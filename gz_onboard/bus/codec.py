@@ -265,6 +265,7 @@ class Codec:
                 for handlers in self._handlers.values():
                     for known in [i for i in handlers if self._is(message, i)]:
                         del handlers[known]
+                        self._room += 1
                 return self._count_copy(time, data)
             if origins.differs(message, channel, identifier, data, silent):
                 for handlers in self._handlers.values():

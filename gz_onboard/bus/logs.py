@@ -50,7 +50,7 @@ _READERS: dict[str, Reader] = {
     _TABLE: _refuse_table,
 }
 _MAGIC = {b"LOGG": ".blf", mcap.MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
-_OTHERS = {
+_FOREIGN_FORMATS = {
     rb"\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x4d\x3c\xb2\xa1|\xa1\xb2\x3c\x4d|\n\r\r\n": (
         "Wireshark's captures are not read; record with candump -L"
     ),
@@ -121,7 +121,7 @@ def log_suffix(path: Path) -> str:
     if suffixes[-1:] == [".gz"]:
         suffixes.pop()
     suffix = suffixes[-1] if suffixes else ""
-    foreign = next((said for start, said in _OTHERS.items() if re.match(start, head)), None)
+    foreign = next((said for start, said in _FOREIGN_FORMATS.items() if re.match(start, head)), None)
     if foreign:
         raise InputError(f"{path}: is not a log that can be read: {foreign}")
     if suffix not in _READERS:
@@ -160,27 +160,24 @@ def _by_content(head: bytes, time: str = "") -> str | None:
     """The format of a file that begins with `head`; None if that is of none."""
     if found := next((form for magic, form in _MAGIC.items() if head.startswith(magic)), None):
         return found
-    if b"\0" in head or any(re.match(start, head) for start in _OTHERS):
+    if b"\0" in head or any(re.match(start, head) for start in _FOREIGN_FORMATS):
         return None
     lines = str(head, "latin-1").removeprefix("\xef\xbb\xbf").split("\n")
     for line in lines:
         if found := next((form for form, first in _FIRST_LINES.items() if first.match(line.strip())), None):
             return found
-    names = {part for code in ("utf-8", "latin-1") for part in re.split(r"\s*[,;\t]\s*", _first_line(head, code))}
-    named = time and time in names
+    first = head.partition(b"\n")[0]
+    columns = [name for code in ("utf-8", "latin-1") for name in re.split(r"[,;\t]", str(first, code, "replace"))]
+    named = time and time in (name.strip('\ufeff" \r') for name in columns)
     return _TABLE if named or _TABLE_HEADER.match(lines[0]) else None
 
 
-def _first_line(head: bytes, code: str) -> str:
-    return str(head, code, "replace").lstrip("\ufeff").partition("\n")[0].replace('"', "").strip()
-
-
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
-    """`paths`, with the logs in it and its folders instead of each folder, by name. InputError for one without any.
+    """`paths`, with the logs in a folder and its subfolders in place of it, by name. InputError for one without any.
 
-    A pattern with ``*`` that the shell left is expanded. Of a folder no .csv or .txt, which are
-    mostly something else, and nothing that ``gz-onboard estimate`` wrote; or, for `estimates`, these in place of the
-    logs that they are of; None: both.
+    A pattern with ``*`` that the shell left is expanded. CSV and text files of a folder are skipped, as they are mostly
+    something else, and so is what ``gz-onboard estimate`` wrote. estimates: take that in place of the logs that it is
+    of; None: take both.
     """
     logs: list[Path] = []
     for path in chain.from_iterable(map(_expanded, paths)):
