@@ -16,7 +16,7 @@ from pathlib import Path
 from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.estimator.signals import LEAPS, Told
+from gz_onboard.estimator.signals import STEP_LIMITS, SelfReported
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.sensors import speed_factors
@@ -31,7 +31,7 @@ PERIOD = 1.0  # s, where nothing says it
 SHORTEST = 0.1  # s: the bus is read every twentieth of a second, however often a message comes
 RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the vehicle file says nothing
 CHARGING = 0.0, 45.0  # degC: likewise
-MOST_OF_A_DAY = 86_400 * LEAPS[ODOMETER][2]  # m
+MOST_OF_A_DAY = 86_400 * STEP_LIMITS[ODOMETER][2]  # m
 CLOCK_SET = 10**18  # ns since 1970: earlier says the clock of a board that begins with 1970 and was not told the time
 
 
@@ -141,9 +141,9 @@ class Day:
         self._kept, self._vehicle = kept, vehicle
         self._date, self._begin = _read(kept, vehicle) if kept else ("", 0.0)  # of the day; the odometer [m] then
         self._last: float | None = None  # m
-        self._told = Told(ODOMETER)
+        self._reported = SelfReported(ODOMETER)
         if self._begin:
-            self._told.said = self._begin, -inf
+            self._reported.accepted = self._begin, -inf
         self._clock_set = False
 
     @property
@@ -153,9 +153,9 @@ class Day:
 
     def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
         """The odometer [m] at a time [ns since 1970], which came at `now` [s]; False if it is not believed."""
-        if not self._told.believes(odometer, now):
+        if not self._reported.accepts(odometer, now):
             return False
-        if self._told.anew:
+        if self._reported.restarted:
             self._date, self._last = "", None
         self._clock_set = stamp_ns >= CLOCK_SET
         if not self._clock_set:

@@ -36,8 +36,8 @@ class Auxiliaries:
             self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
 
     @property
-    def whole(self) -> float:
-        """All of them now [W]."""
+    def total(self) -> float:
+        """What all of them draw now [W]."""
         return self._filed + self.now
 
     @property

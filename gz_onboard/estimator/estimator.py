@@ -25,7 +25,7 @@ from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
 from gz_onboard.estimator.route_ahead import RoadAhead
-from gz_onboard.estimator.signals import DEFAULT_STALE, Signals, Told
+from gz_onboard.estimator.signals import DEFAULT_STALE, SelfReported, Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
@@ -48,8 +48,8 @@ STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be e
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
 LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
 AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
-LEAP = 30.0  # s: whether a longer gap was one, or the clock was set, the odometer says
-COUNT_WITHIN = 3.0  # s after it
+LEAP = 30.0  # s: the odometer shows whether a longer step of time was a gap, or the clock was set
+ODOMETER_WITHIN = 3.0  # s to wait for the odometer after such a step
 NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
@@ -86,15 +86,15 @@ class Estimator:
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None
         self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._vibration else -1
         self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
-        told = {i: [(at, s) for at, s in enumerate(self._slots[i]) if isinstance(s, Told)] for i in range(len(groups))}
-        self._told = {i: own for i, own in told.items() if own or i == self._shaken}
-        self.signals.told[SHOWN].nothing = battery.window.of_cells(0.0)
+        own = [[(at, s) for at, s in enumerate(slots) if isinstance(s, SelfReported)] for slots in self._slots]
+        self._inspected = {i: found for i, found in enumerate(own) if found or i == self._shaken}
+        self.signals.self_reported[SHOWN].zero = battery.window.of_cells(0.0)
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
         self._deadline = float("-inf")
         self._odometer: float | None = None  # m, at the last step
-        self._count = 0.0  # m, the largest of its counts; 0: it has not counted yet
-        self._leapt: float | None = None  # s: the first step after a gap that waits for the odometer
+        self._odometer_step = 0.0  # m, the largest of its counts; 0: it has not counted yet
+        self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activities, self._reading = Activities(), PackReading()
         self._outlook = Outlook(self.forecaster, battery, self.ahead)
         self._distrusted: tuple[str, ...] = ()
@@ -129,8 +129,8 @@ class Estimator:
         self._last_seen[group] = time
         if gap > SLOW_GAP or self._gaps[group]:
             self._timing.watch(group, gap)
-        if group in self._told:
-            values = self._look_at(time, group, values)
+        if group in self._inspected:
+            values = self._inspect(time, group, values)
         for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
             if value is not None:
                 signal.value = value
@@ -142,16 +142,16 @@ class Estimator:
                 return
             self._step(time)
 
-    def _look_at(self, time: float, group: int, values: tuple[float | None, ...]) -> tuple[float | None, ...]:
-        """`values` less what of the vehicle's own leaps; its state of charge becomes that of the cells."""
+    def _inspect(self, time: float, group: int, values: tuple[float | None, ...]) -> tuple[float | None, ...]:
+        """`values` without self-reported ones that jump; the vehicle's state of charge becomes that of the cells."""
         if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
             self._vibration.update(time, accel_z)
         plausible = list(values)
-        for i, signal in self._told[group]:
+        for i, signal in self._inspected[group]:
             value = values[i]
             if value is not None:
                 value = self.battery.window.of_cells(value) if signal.role == SHOWN else value
-                plausible[i] = value if signal.believes(value, time) else None
+                plausible[i] = value if signal.accepts(value, time) else None
         return tuple(plausible)
 
     def _await_pace(self, time: float) -> bool:
@@ -165,7 +165,7 @@ class Estimator:
         return True
 
     def _step(self, now: float) -> None:
-        dt = self._passed(now)
+        dt = self._elapsed(now)
         if dt is None or (dt < SHORTEST_STEP and self._time is not None):
             return
         self._time = now
@@ -189,26 +189,26 @@ class Estimator:
         elif self._outlook.due(now):
             self._look_ahead(now, self.filter, temperature)
 
-    def _passed(self, now: float) -> float | None:
-        """The time since the last step [s], without what the clock was set by; None: the odometer has yet to tell.
+    def _elapsed(self, now: float) -> float | None:
+        """The time since the last step [s], less what the clock was set by; None until the odometer shows which it was.
 
-        What rides at both ends of a gap has ridden on in it, and the odometer has counted that.
+        A vehicle that moves at both ends of a gap has moved during it, and its odometer has counted the distance.
         """
         dt = 0.0 if self._time is None else now - self._time
         odometer, speed = self.signals.odometer, self.road.speed or 0.0
         moved = 0.0 if self._odometer is None else odometer.value - self._odometer
-        if dt > LEAP and self._count and speed > MOVING:
-            self._leapt = self._leapt or now
-            came = odometer.time >= self._leapt - STEP_AT_LEAST
-            if not came and now - self._leapt < COUNT_WITHIN:
+        if dt > LEAP and self._odometer_step and speed > MOVING:
+            self._clock_leap = self._clock_leap or now
+            came = odometer.time >= self._clock_leap - STEP_AT_LEAST
+            if not came and now - self._clock_leap < ODOMETER_WITHIN:
                 return None
             self.road.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
             least = min(speed, self.road.speed or 0.0) * dt / 2
-            if came and 0 <= moved + self._count < least:
-                dt, moved = max(now - self._leapt, SHORTEST_STEP), 0.0
+            if came and 0 <= moved + self._odometer_step < least:
+                dt, moved = max(now - self._clock_leap, SHORTEST_STEP), 0.0
         elif 0 < moved < UNLEARNED:
-            self._count = max(self._count, moved)
-        self._leapt, self._odometer = None, odometer.last
+            self._odometer_step = max(self._odometer_step, moved)
+        self._clock_leap, self._odometer = None, odometer.last
         return dt
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
@@ -237,8 +237,8 @@ class Estimator:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        carried = self.forecaster.riding.carried  # then no energy of the bus shows a grade
-        power = None if voltage is None or current is None or modelled or carried else voltage * current
+        towed = self.forecaster.riding.towed  # then no energy of the bus shows a grade
+        power = None if voltage is None or current is None or modelled or towed else voltage * current
         before = grades.faulty
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
         if grades.faulty != before:
@@ -307,7 +307,7 @@ class Estimator:
             return voltage * current
         if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
             return torque * turning
-        return power - self.forecaster.auxiliaries.whole
+        return power - self.forecaster.auxiliaries.total
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)

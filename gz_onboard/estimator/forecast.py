@@ -142,7 +142,7 @@ class Forecaster:
         r = self.riding
         r.add(dt, speed, grade, power, inputs)
         r.second.driven += (power if drive is None else drive) * dt
-        if not r.carried:
+        if not r.towed:
             self.calm.ride(abs(speed) * dt)
         if r.second.seconds < max(1.0, period):
             return False
@@ -157,7 +157,7 @@ class Forecaster:
         if abs(mean) > MOVING and grade is not None:
             beside = self.auxiliaries.now * r.second.seconds
             self._coast(modelled - (to_come - stored + r.second.energy - beside) / 2)
-            if r.carried:
+            if r.towed:
                 self.pause()
                 return False
         if self.load.ledger:
@@ -189,9 +189,9 @@ class Forecaster:
     def _coast(self, unexplained: float) -> None:
         """Take in the second: what the model asks for beyond half of a level road's and of what was measured [J]."""
         r, weight = self.riding, self._weight
-        driven, before = r.second.driven > DRIVES * weight * abs(r.second.distance), r.carried
+        driven, before = r.second.driven > DRIVES * weight * abs(r.second.distance), r.towed
         r.coast(None if driven else unexplained, HEIGHTS_ERR * weight)
-        if r.carried and not before:
+        if r.towed and not before:
             r.take_back(r.coasted)
             self._sum_past()
 

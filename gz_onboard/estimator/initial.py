@@ -8,7 +8,7 @@ from math import exp, hypot, inf, sqrt
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.start import Saved, bounded, from_voltage, limited, parked, uncounted, update_soc
+from gz_onboard.estimator.start import Saved, bounded, from_voltage, limit_soc_variance, parked, uncounted, update_soc
 from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
@@ -166,6 +166,6 @@ def first_filter(
         else:
             counted = before, variance
         update_soc(filter_, before, variance)
-        filter_.covariance = limited(filter_.covariance)
+        filter_.covariance = limit_soc_variance(filter_.covariance)
     filter_.soc = bounded(filter_.soc)
     return filter_, counted

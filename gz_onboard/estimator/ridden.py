@@ -86,7 +86,7 @@ class Riding:
     still: float = 0.0  # s since the last motion
     coasted: float = 0.0  # m without the motor, of which road and bus leave something
     unexplained: float = 0.0  # J
-    carried: bool = False  # so much that something else moves the vehicle
+    towed: bool = False  # so much that something else moves the vehicle
 
     @property
     def factor(self) -> float:
@@ -113,7 +113,7 @@ class Riding:
         left = 0.0 if unexplained is None else self.unexplained + unexplained
         self.unexplained = min(max(left, 0.0), 2 * most)
         self.coasted = self.coasted + abs(self.second.distance) if self.unexplained else 0.0
-        self.carried = self.unexplained > most
+        self.towed = self.unexplained > most
 
     def take_back(self, distance: float) -> None:
         """Unlearn the last `distance` [m] or a little more."""

@@ -108,7 +108,7 @@ class RoadAhead:
 
     def ride(self, dt: float, speed: float, power: float) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
-        if self._segment and not self._forecaster.riding.carried:
+        if self._segment and not self._forecaster.riding.towed:
             self._ridden += abs(speed) * dt
             self._energy += (power - self._forecaster.auxiliaries.now) * dt
 

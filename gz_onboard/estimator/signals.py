@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from gz_onboard.constants import HOUR
 from gz_onboard.events import ROLES
 
-LEAPS = {  # by how much a value may rise and fall from one message to the next, and beyond that in a second
+STEP_LIMITS = {  # most rise and fall from one message to the next, and more per second in between
     "bms_state_of_charge": (0.15, 0.15, 6 / HOUR),
     "odometer": (2000.0, 0.0, 70.0),  # m
 }
-DOUBTED = 600.0  # s: a value that leaped is believed after so long: it was set
+ACCEPTED_AFTER = 600.0  # s: a jump that persists for so long is real, such as an odometer that was set
 DEFAULT_STALE = 2.0  # s, for messages of unknown period
 FIX_2D, FIX_3D = 2, 3  # of `gps_fix`: a position, an altitude
 
@@ -57,38 +57,38 @@ class Signal:
         return self.total / self.count if self.count else self.value
 
 
-class Told(Signal):
-    """What a vehicle says of itself: believed while it goes on from what it said before.
+class SelfReported(Signal):
+    """A value that the vehicle computes itself: accepted while it continues from the value before.
 
-    An ECU may say 0, or anything, until it has found what it kept, and while it falls asleep.
+    An ECU may send 0, or anything, until it has read its memory after waking, and while it falls asleep.
     """
 
-    __slots__ = ("anew", "doubt", "nothing", "role", "said")
+    __slots__ = ("accepted", "rejected", "restarted", "role", "zero")
 
     def __init__(self, role: str) -> None:
         super().__init__()
-        self.role, self.nothing = role, 0.0  # what stands for 0: only what was small before becomes that
-        self.said: tuple[float, float] | None = None  # the last that was believed, and when [s]
-        self.doubt: tuple[float, float, float] | None = None  # the last that was not, when, and since when [s]
-        self.anew = False  # the last leaped, and has persisted
+        self.role, self.zero = role, 0.0  # a placeholder, unless the value was near it before
+        self.accepted: tuple[float, float] | None = None  # value and its time [s]
+        self.rejected: tuple[float, float, float] | None = None  # value, its time, since when [s]
+        self.restarted = False  # the last value jumped, and the jump has persisted
 
-    def believes(self, value: float, now: float) -> bool:
-        """Whether `value`, of `now` [s], is to be taken."""
-        self.anew = False
-        if not self._follows(self.said, value, now):
-            since = self.doubt[2] if self.doubt and self._follows(self.doubt[:2], value, now) else now
-            self.doubt = value, now, since
-            self.anew = value != self.nothing and now - since >= DOUBTED
-            if not self.anew:
+    def accepts(self, value: float, now: float) -> bool:
+        """Whether the `value` that came at `now` [s] is plausible."""
+        self.restarted = False
+        if not self._follows(self.accepted, value, now):
+            since = self.rejected[2] if self.rejected and self._follows(self.rejected[:2], value, now) else now
+            self.rejected = value, now, since
+            self.restarted = value != self.zero and now - since >= ACCEPTED_AFTER
+            if not self.restarted:
                 return False
-        self.said, self.doubt = (value, now), None
+        self.accepted, self.rejected = (value, now), None
         return True
 
     def _follows(self, before: tuple[float, float] | None, value: float, now: float) -> bool:
         if before is None:
-            return value != self.nothing
-        rise, fall, rate = LEAPS[self.role]
-        more = rate * (now - before[1]) if value != self.nothing else 0.0
+            return value != self.zero
+        rise, fall, rate = STEP_LIMITS[self.role]
+        more = rate * (now - before[1]) if value != self.zero else 0.0
         return -(fall + more if fall else 0.0) <= value - before[0] <= rise + more
 
 
@@ -96,12 +96,12 @@ class Signals:
     """All roles as attributes by name; those that the vehicle does not have are always stale."""
 
     def __init__(self, stale_after: Iterable[tuple[str, float]]) -> None:
-        self.told = {role: Told(role) for role in LEAPS}
-        self._all = {role: self.told.get(role) or Signal() for role in ROLES}
+        self.self_reported = {role: SelfReported(role) for role in STEP_LIMITS}
+        self._all = {role: self.self_reported.get(role) or Signal() for role in ROLES}
         for role, seconds in stale_after:
             self._all[role].stale_after = seconds
         self.__dict__ |= self._all
-        self.carried = False  # the receiver moves and the vehicle rests: what it shows is of a van
+        self.carried = False  # only the GPS receiver moves: the vehicle is in a van
         self._mapped = [signal for signal in self._all.values() if signal.stale_after]
 
     if TYPE_CHECKING:
@@ -109,14 +109,14 @@ class Signals:
         def __getattr__(self, role: str) -> Signal: ...
 
     @property
-    def doubted(self) -> bool:
-        """Whether the vehicle says something of itself that does not go on from what it said."""
-        return any(told.said and told.doubt for told in self.told.values())
+    def has_rejected(self) -> bool:
+        """Whether the last self-reported value of any role was rejected."""
+        return any(signal.accepted and signal.rejected for signal in self.self_reported.values())
 
-    def resume(self, said: Mapping[str, float | None]) -> None:
-        """Go on from what the vehicle said before, by role."""
-        for role, value in said.items():
-            self.told[role].said = None if value is None else (value, -inf)
+    def resume(self, values: Mapping[str, float | None]) -> None:
+        """Continue from the values that the vehicle reported before, by role."""
+        for role, value in values.items():
+            self.self_reported[role].accepted = None if value is None else (value, -inf)
 
     def __getitem__(self, role: str) -> Signal:
         return self._all[role]

@@ -23,7 +23,15 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
-from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, limited, plausible, uncounted_sd
+from gz_onboard.estimator.start import (
+    BRIDGE,
+    SOC_UNKNOWN_SD,
+    Saved,
+    bounded,
+    limit_soc_variance,
+    plausible,
+    uncounted_sd,
+)
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -33,7 +41,7 @@ DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the firs
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 JOINED = 900.0  # s: how long ago a ride began that is joined under way, for all that is known
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
-NOTHING_FOR = 60.0  # s: a current that reads exactly 0 for longer may be any small one
+ZERO_FOR = 60.0  # s: a current that reads exactly 0 for longer may be any small one
 SHORTEST = 0.02  # s: a step, to divide by
 
 
@@ -87,7 +95,7 @@ class StateOfCharge:
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
-        self._nothing = 0.0  # s for which the current has read 0
+        self._zero_time = 0.0  # s for which the current has read 0
         self.another_pack = False  # whether this step has shown it to be another than it was
 
     # --- what others ask --------------------------------------------------------------------------------------
@@ -209,7 +217,7 @@ class StateOfCharge:
         if dt > 0:
             self._predict(filter_, now, dt, pack, riding)
         self.current = current
-        self._follow_told(now, dt, pack.speed)
+        self._track_self_reported(now, dt, pack.speed)
         if voltage is None or current is None:
             self.gate.innovation = None
             return
@@ -228,7 +236,7 @@ class StateOfCharge:
             voltage, current = pair
         self._update(filter_, now, dt, (voltage, current), pack)
 
-    def _follow_told(self, now: float, dt: float, speed: float | None) -> None:
+    def _track_self_reported(self, now: float, dt: float, speed: float | None) -> None:
         own_soc, odometer = self._signals.bms_state_of_charge, self._signals.odometer
         if own_soc.fresh(now):
             self._own_soc = own_soc.value
@@ -250,27 +258,27 @@ class StateOfCharge:
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
         if dt > pause or (counted is CurrentSource.NONE and pack.reading.unmeasured):
-            q += self._charge.one_way(uncounted_sd(dt), sqrt(filter_.covariance[0]))
+            q += self._charge.uncounted(uncounted_sd(dt), sqrt(filter_.covariance[0]))
             self._rest.interrupt()
-        elif self._shows_nothing(now, dt, pack.reading):
+        elif self._reads_zero(now, dt, pack.reading):
             load = self._auxiliary_power / (pack.reading.voltage or self.rest_voltage)
-            q += self._charge.one_way(load * dt / charge, sqrt(filter_.covariance[0]))
+            q += self._charge.uncounted(load * dt / charge, sqrt(filter_.covariance[0]))
         if self._own_soc is not None:
             self._own_soc -= mean * dt / charge
         before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         self.ageing.count(filter_, before, mean * dt / charge)
         if filter_.covariance[0] > SOC_UNKNOWN_SD**2:
-            filter_.covariance = limited(filter_.covariance)
+            filter_.covariance = limit_soc_variance(filter_.covariance)
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
 
-    def _shows_nothing(self, now: float, dt: float, reading: PackReading) -> bool:
+    def _reads_zero(self, now: float, dt: float, reading: PackReading) -> bool:
         """Whether the current has read exactly 0 for long: many sensors show small currents, as of what is on, so."""
         nothing = reading.source is CurrentSource.PACK and self._signals.pack_current.value == 0.0
-        self._nothing = self._nothing + dt if nothing and self._signals.contactor.get(now) != 0 else 0.0
-        return self._nothing > NOTHING_FOR
+        self._zero_time = self._zero_time + dt if nothing and self._signals.contactor.get(now) != 0 else 0.0
+        return self._zero_time > ZERO_FOR
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""
@@ -358,7 +366,7 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
-        least = DOUBT_WAIT if self.saved and self._signals.doubted else START_WAIT if missing else STEADY_TIME
+        least = DOUBT_WAIT if self.saved and self._signals.has_rejected else START_WAIT if missing else STEADY_TIME
         battery = self._battery
         found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, least)
         if found is None:

@@ -51,7 +51,7 @@ def bounded(soc: float) -> float:
     return min(max(soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
 
 
-def limited(covariance: Covariance) -> Covariance:
+def limit_soc_variance(covariance: Covariance) -> Covariance:
     """`covariance`, of a SOC that is no less known than not at all."""
     p00, p01, p11 = covariance
     share = min(SOC_UNKNOWN_SD / sqrt(p00), 1.0)

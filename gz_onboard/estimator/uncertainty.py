@@ -69,7 +69,7 @@ class ChargeUncertainty:
         """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
         return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > COARSE else 0.0
 
-    def one_way(self, more: float, soc_sd: float) -> float:
+    def uncounted(self, more: float, soc_sd: float) -> float:
         """Variance after `more` of SOC may have flowed that was not counted, as in a pause.
 
         What was taken for it errs the same way each time: the rider goes on as before, the load stays. soc_sd: what is

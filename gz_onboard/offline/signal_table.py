@@ -91,7 +91,7 @@ def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, 
         if at != time_at
         and (text.strip() or not all(_is_missing(row[at]) for _, row in rows))  # a separator at each line's end
     ]
-    columns = _told_apart(file, columns, mapping.columns)
+    columns = _without_duplicates(file, columns, mapping.columns)
     database = _database(columns)
     sources = column_sources(database, mapping.columns, file) if mapping.columns else _by_role(file, columns)
     played = {source.signal: source.role for source in sources}
@@ -151,18 +151,18 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
     return rows_of(list(zip(table.column_names, table.columns, strict=True)), str(file))
 
 
-def _time_column(file: Path, header: Sequence[str], told: TimeColumn | None) -> tuple[int, TimeColumn]:
+def _time_column(file: Path, header: Sequence[str], configured: TimeColumn | None) -> tuple[int, TimeColumn]:
     """The index of the column of times, and its name as errors call it."""
     names = [name.strip() for name in header]
-    if told:
-        if told.name not in names:
+    if configured:
+        if configured.name not in names:
             raise InputError(
-                f"{file}:1: there is no column {shown(told.name)}, which is the time in the vehicle file"
-                f"{nearest(told.name, names)}"
+                f"{file}:1: there is no column {shown(configured.name)}, which is the time in the vehicle file"
+                f"{nearest(configured.name, names)}"
             )
-        if names.count(told.name) > 1:
-            raise InputError(f"{file}:1: two columns are called {told.name!r}")
-        return names.index(told.name), told
+        if names.count(configured.name) > 1:
+            raise InputError(f"{file}:1: two columns are called {configured.name!r}")
+        return names.index(configured.name), configured
     for at, name in enumerate(names):
         if found := _TIME.fullmatch(name):
             return at, TimeColumn(name, (found["unit"] or "").lower())
@@ -172,7 +172,7 @@ def _time_column(file: Path, header: Sequence[str], told: TimeColumn | None) -> 
     )
 
 
-def _told_apart(file: Path, columns: list[_Column], roles: Table | None) -> list[_Column]:
+def _without_duplicates(file: Path, columns: list[_Column], roles: Table | None) -> list[_Column]:
     """`columns` without those of one name that no role asks for; InputError if one does."""
     names = [column.name for column in columns]
     twice = {name for name in names if names.count(name) > 1}
@@ -188,7 +188,7 @@ def _times(file: Path, column: TimeColumn, rows: Sequence[tuple[int, Any]]) -> l
     times: list[int] = []
     for line, cell in rows:
         try:
-            times.append(_nanoseconds(_dated(cell, column.format), unit))
+            times.append(_nanoseconds(_parsed_date(cell, column.format), unit))
         except KeyError:
             raise InputError(
                 f"{file}:{line}: {name}: {shown(cell)} has no unit; call the column 'time [s]' or 'time [ms]'"
@@ -216,7 +216,7 @@ def _times(file: Path, column: TimeColumn, rows: Sequence[tuple[int, Any]]) -> l
     return [time - times[0] for time in times] if times[0] < 0 else times
 
 
-def _dated(cell: object, form: str) -> object:
+def _parsed_date(cell: object, form: str) -> object:
     """A text of this `form` as its date; what is a date already, or without a form, as it is."""
     return datetime.strptime(str(cell).strip(), form) if form and not isinstance(cell, date) else cell
 

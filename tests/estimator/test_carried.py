@@ -41,7 +41,7 @@ def test_a_tow_is_known_by_current_or_torque(seen):
     before = e.forecaster.riding.usual.price.now
     for event in roll(400, 600.0, 0.0, seen):
         e.handle(event)
-    assert e.forecaster.riding.carried
+    assert e.forecaster.riding.towed
     assert e.forecaster.riding.usual.price.now == pytest.approx(before, rel=0.02)
 
 

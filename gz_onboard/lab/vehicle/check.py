@@ -73,7 +73,7 @@ def check_log(
     mapping, frames = open_ride(log, vehicle)
     codec = Codec(mapping, LONGEST_PAUSE_NS)
     lengths: dict[int, int] = {}
-    columns = read_roles(log, vehicle, (codec, _noting(frames, lengths)), progress)
+    columns = read_roles(log, vehicle, (codec, _recording_lengths(frames, lengths)), progress)
     samples = Samples(ride_name(log), columns, facts_of(log))
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += _never_came(codec, columns, lengths, _passed(columns)[0])
@@ -103,7 +103,7 @@ def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
     return end - start - float(steps[steps > PAUSE].sum()), end
 
 
-def _noting(frames: Iterable[list[Frame]], lengths: dict[int, int]) -> Iterator[list[Frame]]:
+def _recording_lengths(frames: Iterable[list[Frame]], lengths: dict[int, int]) -> Iterator[list[Frame]]:
     """The frames; `lengths` gets that of each identifier."""
     for batch in frames:
         lengths.update({frame[1]: len(frame[2]) for frame in batch})
@@ -121,7 +121,7 @@ def _never_came(
         if silent and not set(group) & set(columns) and duration > late:
             roles = tuple(source.role for source in silent)
             without = "no range" if group in needed else "no energy"
-            text = f"{words(roles[0])} never came: {without}{_alike(codec, silent[0], lengths)}"
+            text = f"{words(roles[0])} never came: {without}{_likely_identifier(codec, silent[0], lengths)}"
             yield wrong("never came", roles, text)
 
 
@@ -130,7 +130,7 @@ def _stale(period: float | None) -> float:
     return STALE_PERIODS * period if period else DEFAULT_STALE
 
 
-def _alike(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:
+def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:
     """The unknown identifier that is most like that of a message which never came, if its frames are as long."""
     message = next((m for m in codec.mapping.database.messages if m.name == source.message), None)
     if message is None:
