@@ -66,7 +66,7 @@ def _verdict(text: str, off: float, sd: float) -> Finding:
     if off > WRONG_SD:
         return wrong(BY_VOLTAGE, ROLES, f"{text}: {_CAUSES}")
     if off > RIGHT_SD:
-        return unknown(BY_VOLTAGE, ROLES, f"{text}: if that is no chance, {_CAUSES}")
+        return unknown(BY_VOLTAGE, ROLES, f"{text}: unless by chance, {_CAUSES}")
     if sd > VAGUE:
         return unknown(BY_VOLTAGE, ROLES, f"{text}: too vague to tell")
     return right(BY_VOLTAGE, ROLES, text)

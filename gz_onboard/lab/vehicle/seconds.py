@@ -92,7 +92,7 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
 
 
 def too_little(speed: Array, what: str) -> str:
-    """Why motion does not tell: the vehicle moves at this `speed` (n,) [m/s] too little, or `what` are not there."""
+    """Say why `what` cannot be compared: too little motion at this `speed` (n,) [m/s], or they are not there."""
     moving = int(np.sum(np.abs(speed) > MOVING))
     if moving < FEWEST:
         return f"the vehicle moves for {moving} s in this log, and {FEWEST} s are needed"
