@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Container
 
-from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.signals import FIX_3D, Signals
-from gz_onboard.events import OF_RIDING, ROLES, Reason
+from gz_onboard.events import OF_RIDING, ROLES, SPEEDS, Reason
 
 # What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
 LOSS_SD = {
@@ -41,7 +40,7 @@ def lacking(roles: Container[str]) -> Reason:
     for reason, needed in NEEDED.items():
         if not all(role in roles for role in needed):
             reasons |= reason
-    for reason, one_of in ((Reason.NO_SPEED, SpeedCheck.ROLES), (Reason.NO_GPS, POSITION)):
+    for reason, one_of in ((Reason.NO_SPEED, SPEEDS), (Reason.NO_GPS, POSITION)):
         if not any(role in roles for role in one_of):
             reasons |= reason
     return reasons
@@ -55,7 +54,7 @@ class MissingSignals:
         self.lacking = lacking(mapped)
         self._signals = signals
         self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles if role in mapped]
-        self._speeds = [signals[role] for role in SpeedCheck.ROLES]
+        self._speeds = [signals[role] for role in SPEEDS]
         self._with_speed, self._with_gps = (not self.lacking & r for r in (Reason.NO_SPEED, Reason.NO_GPS))
 
     def reasons(self, now: float, charged: bool = False) -> Reason:
