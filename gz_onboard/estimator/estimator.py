@@ -284,7 +284,7 @@ class Estimator:
             return
         power = reading.voltage * reading.current
         self.ahead.ride(dt, speed, power)
-        learned = self.forecaster.ride(
+        self.forecaster.ride(
             dt,
             speed,
             self.road.grade,
@@ -294,8 +294,6 @@ class Estimator:
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
             self._drive(now, reading.voltage, power),
         )
-        if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
-            self.plausibility.pack.compare_consumption(self.forecaster.recent_factor)
 
     def _drive(self, now: float, voltage: float, power: float) -> float:
         """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""

@@ -13,7 +13,7 @@ from gz_onboard.estimator.plausibility.inertial import GradeCheck
 from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, StepInputs, faulty
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck, vote
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import CURRENTS, ROLES
+from gz_onboard.events import ROLES
 from gz_onboard.vehicle import read_vehicle
 
 RADIUS, GEAR, CAPACITY = 0.25, 0.5, 30.0  # m; wheel speed over motor speed; Ah
@@ -238,26 +238,6 @@ VEHICLE = read_vehicle("reference", 75.0)
 def pack_sensors(roles: tuple[str, ...]) -> tuple[PackSensors, Signals]:
     signals = Signals((role, 2.0) for role in roles)
     return PackSensors(signals, VEHICLE.pack, VEHICLE.parameters), signals
-
-
-@pytest.mark.parametrize(
-    ("sags", "takes", "left_out"),
-    [(1.0, 0.4, False), (2.0, 1.0, False), (2.0, 0.5, True), (0.45, 2.0, True)],
-    ids=["frugal rider", "aged pack", "currents too small", "currents too large"],
-)
-def test_only_sag_and_consumption_together_show_that_all_currents_are_scaled(sags: float, takes: float, left_out: bool):
-    check, signals = pack_sensors(("pack_current", "inverter_current", "pack_voltage"))
-    evidence = CellEvidence(lambda voltage, current, sensor: 0.0, lambda: None, 0.0)
-    for step in range(3000):
-        drop = 0.08 * (1 + sin(step * STEP))
-        check.sag.update(STEP, 3.7 - sags * drop, drop)
-    check.compare_consumption(takes)
-    for step in range(100):
-        t = step * STEP
-        for role, value in {"pack_current": 20.0, "inverter_current": 19.0, "pack_voltage": 50.0}.items():
-            signals[role].value, signals[role].time = value, t
-        check.read(t, STEP, 10.0, evidence)
-    assert faulty(check.counters) == (set(CURRENTS[:2]) if left_out else set())
 
 
 @pytest.mark.parametrize("roles", [("pack_current",), ("pack_current", "inverter_current")])

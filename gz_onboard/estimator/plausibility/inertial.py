@@ -18,6 +18,7 @@ from gz_onboard.estimator.plausibility.residual import (
     ResidualTest,
     StepInputs,
     UnchangedTimer,
+    count,
     faulty,
     isolate,
     share_of_new,
@@ -72,8 +73,8 @@ class GradeDifference:
 
     def __init__(self, sd: float) -> None:
         self._sd = sd
-        self._difference = ResidualTest(CONFIG.grade_m)
-        self._usual, self._before, self._latest = (ResidualTest(CONFIG.usual_m) for _ in range(3))
+        self._difference, self._usual = ResidualTest(CONFIG.grade_m), ResidualTest(CONFIG.usual_m)
+        self._usual.seen = CONFIG.usual_prior_m
 
     @property
     def usual(self) -> float:
@@ -88,7 +89,7 @@ class GradeDifference:
     @property
     def residual(self) -> float:
         """The same over its sd, which is larger over a short distance and before the usual one is known."""
-        unknown = CONFIG.usual_most * max(1 - self._usual.seen / CONFIG.grade_m, 0.0)
+        unknown = CONFIG.usual_most * max(1 - (self._usual.seen - CONFIG.usual_prior_m) / CONFIG.grade_m, 0.0)
         short = CONFIG.grade_m / max(min(self._difference.seen, CONFIG.grade_m), 1.0)
         return abs(self.unusual) / hypot(self._sd * sqrt(short), unknown)
 
@@ -96,17 +97,9 @@ class GradeDifference:
         """Add `climb` [m] of the one witness beyond that of the other over `distance` [m]."""
         self._difference.update(distance, climb / distance)
 
-    def learn(self, distance: float, climb: float) -> None:
-        """Take this for usual, once another `grade_m` was ridden without a doubt: a fault grows out of noise."""
-        self._latest.update(distance, climb / distance)
-        if self._latest.seen >= CONFIG.grade_m:
-            if self._before.seen:
-                self._usual.update(self._before.seen, self._before.difference)
-            self._before, self._latest = self._latest, ResidualTest(CONFIG.usual_m)
-
-    def doubt(self) -> None:
-        """Learn nothing from the last stretches."""
-        self._before, self._latest = ResidualTest(CONFIG.usual_m), ResidualTest(CONFIG.usual_m)
+    def learn(self, distance: float) -> None:
+        """Learn the usual difference from another `distance` [m] without a doubt."""
+        self._usual.update(distance, self._difference.difference)
 
 
 class AccelerometerGain:
@@ -231,14 +224,11 @@ class GradeCheck:
             return
         if not against and residual > CONFIG.agreeing_residual:
             return  # nothing is proven
-        weight = CONFIG.dispute_weight if len(against) > 1 else 1.0
         for role, counter in self.counters.items():
-            counter.update(weight * seconds, role in against)
-        for pair, difference in known:
-            if against or self.faulty:
-                pair.doubt()
-            else:
-                pair.learn(distance, difference)
+            count(counter, seconds, role in against, len(against) > 1)
+        if not against and not self.faulty:
+            for pair, _ in known:
+                pair.learn(distance)
 
     @property
     def faulty(self) -> frozenset[str]:

@@ -32,7 +32,7 @@ class PlausibilityConfig:
     settled_after_s: float = 30.0  # a signal or model that has held for so long is a reference
     evidence_s: float = 1.0  # one value after a silence is no more evidence than this
     stuck_s: float = 1.0  # a fast sensor that does not change to the last bit while others do
-    slowly_stuck_s: float = 10.0  # a single speed or a voltage, which may be steady or coarse
+    slowly_stuck_s: float = 10.0  # a single speed, which may be steady
     moving_m_s: float = 2.0  # slower, wheel sensors lose their teeth and agreement proves little
     standstill_m_s: float = 0.05
 
@@ -73,7 +73,6 @@ class PlausibilityConfig:
     cell_model_time_s: float = 300.0  # over which the usual error of the cell model is learned
     lowest_voltage_ratio: float = 0.6  # of the cut-off voltage
     highest_voltage_ratio: float = 1.12  # of the voltage of a full cell at rest
-    stuck_voltage_rate: float = 0.5  # 1/h; a current that changes by more moves the voltage
 
     # Voltage sag over the predicted one: 0.6 to 1.3 on recorded rides, up to 2 on an aged pack.
     sag_fast_s: float = 0.5  # high pass
@@ -82,7 +81,6 @@ class PlausibilityConfig:
     sag_low: float = 0.55
     sag_high: float = 1.45
     sag_explained_share: float = 0.6  # of the variance of the voltage
-    scaled_consumption: float = 1.5  # measured over modelled or the inverse; frugal riders and hills reach it
 
     # Inertial unit and grade (sine of the road's angle).
     axis_time_s: float = 30.0
@@ -93,11 +91,12 @@ class PlausibilityConfig:
     gain_factor: float = 1.6  # of the accelerometer over the wheels, or the inverse
     hardest_m_s2: float = 10.0  # no wheel grips more
     grade_m: float = 1000.0  # length of the comparison
-    usual_m: float = 3000.0  # over which the mounting angle and the model's usual error are learned
+    usual_m: float = 5000.0  # over which the mounting angle and the model's usual error are learned
+    usual_prior_m: float = 500.0  # weight of the expectation that there is none
     usual_most: float = 0.05  # three degrees of mounting
     grade_sd: float = 0.022  # accelerometer against altitude; 0.010 at most on the commissioning rides
     energy_sd: float = 0.06  # against the energy, most of it wind
-    energy_decides_sd: float = 0.02  # wind is common to both comparisons with the energy
+    energy_decides_sd: float = 0.01  # wind is common to both comparisons with the energy
     steepest: float = 0.3
     altitude_jump_m: float = 6.0  # of a receiver
     altitude_wander_m_s: float = 1.0
@@ -187,6 +186,11 @@ class FaultCounter:
 def faulty(counters: Mapping[str, FaultCounter]) -> frozenset[str]:
     """Roles whose sensors are faulty."""
     return frozenset(role for role, counter in counters.items() if counter.faulty)
+
+
+def count(counter: FaultCounter, dt: float, contradicts: bool | None, disputed: bool) -> None:
+    """Add `dt` [s] to a counter; less where two members contradict each other and nothing decides."""
+    counter.update(CONFIG.dispute_weight * dt if disputed else dt, contradicts)
 
 
 class UnchangedTimer:

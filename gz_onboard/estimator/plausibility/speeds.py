@@ -12,6 +12,7 @@ from gz_onboard.estimator.plausibility.residual import (
     ResidualTest,
     StepInputs,
     UnchangedTimer,
+    count,
 )
 from gz_onboard.estimator.signals import FIX_2D
 from gz_onboard.events import SPEEDS
@@ -130,8 +131,7 @@ class SpeedCheck:
         for role in speeds:
             against = role in outvoted | tied
             comparable = middle > CONFIG.moving_m_s and self._unchanged[role].seconds < CONFIG.stuck_s
-            weight = CONFIG.dispute_weight if role in tied else 1.0
-            self.counters[role].update(weight * dt, against if against or comparable else None)
+            count(self.counters[role], dt, against if against or comparable else None, role in tied)
             step.signals[role].trusted = not (self.counters[role].faulty or role in outvoted)
 
     def _follow_wheelspin(self, dt: float, speeds: Mapping[str, float]) -> bool:
