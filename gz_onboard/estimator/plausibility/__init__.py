@@ -14,7 +14,7 @@ from __future__ import annotations
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.plausibility.electrical import PackSensors
 from gz_onboard.estimator.plausibility.inertial import GradeCheck, InertialCheck
-from gz_onboard.estimator.plausibility.residual import StepInputs, faulty
+from gz_onboard.estimator.plausibility.residual import StepInputs
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck
 from gz_onboard.estimator.plausibility.temperatures import TemperatureCheck
 from gz_onboard.estimator.signals import Signals
@@ -46,5 +46,4 @@ class Plausibility:
     @property
     def distrusted(self) -> tuple[str, ...]:
         """Roles that are left out, in a fixed order."""
-        found = faulty(self._counters)
-        return tuple(role for role in self._counters if role in found)
+        return tuple(role for role, counter in self._counters.items() if counter.faulty)

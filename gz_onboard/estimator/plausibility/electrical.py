@@ -16,7 +16,6 @@ from gz_onboard.estimator.plausibility.residual import (
     NO_SENSOR,
     FaultCounter,
     ResidualTest,
-    count,
     faulty,
     isolate,
     share_of_new,
@@ -200,7 +199,7 @@ class PackSensors:
         flows = any(abs(current) > CONFIG.current_sd_rate * self._capacity for current in currents.values())
         agree = False if comparable and not against and flows and self.current_difference.agrees else None
         for role in self._signals.mapped(CURRENTS):
-            count(self.counters[role], dt, True if role in against else agree, disputed)
+            self.counters[role].update(dt, True if role in against else agree, disputed)
             self._signals[role].trusted = not self.counters[role].faulty and (disputed or role not in against)
         if disputed:
             return fmean(currents.values()), CurrentSource.DISPUTED
@@ -241,7 +240,7 @@ class PackSensors:
                 self._by_cells[role].restart()
         disputed = self.voltage_dispute > 0
         for role in self._signals.mapped(VOLTAGES):
-            count(self.counters[role], dt, True if role in against else agree if role in cells else None, disputed)
+            self.counters[role].update(dt, True if role in against else agree if role in cells else None, disputed)
             self._signals[role].trusted = disputed or not (role in against or self.counters[role].faulty)
         if disputed:
             return fmean(voltages.values())

@@ -18,7 +18,6 @@ from gz_onboard.estimator.plausibility.residual import (
     ResidualTest,
     StepInputs,
     UnchangedTimer,
-    count,
     faulty,
     isolate,
     share_of_new,
@@ -203,32 +202,29 @@ class GradeCheck:
             (self._energy_altitude, energy, rise),
         )
         known = [(pair, first - second) for pair, first, second in pairs if first is not None and second is not None]
+        if not known:
+            return
         for pair, difference in known:
             pair.add(distance, difference)
-        against = NO_SENSOR
-        if climb is not None and rise is not None:
-            residual = self._inertial.residual
-            if residual > 1:
-                by_energy = (self._energy_inertial.unusual, self._energy_altitude.unusual)
-                wrong = (
-                    isolate(*((off / CONFIG.energy_decides_sd) ** 2 for off in by_energy))
-                    if self._work is not None
-                    else 0
-                )
-                against = ACCELEROMETER if wrong_gain else (ACCELEROMETER | ALTITUDE, ACCELEROMETER, ALTITUDE)[wrong]
-        elif known:  # a single witness against the energy
-            residual = known[0][0].residual
-            if residual > 1:
-                against = ACCELEROMETER if rise is None else ALTITUDE
-        else:
-            return
-        if not against and residual > CONFIG.agreeing_residual:
+        residual = known[0][0].residual  # accelerometer against altitude, or a single one of them against the energy
+        if CONFIG.agreeing_residual < residual <= 1:
             return  # nothing is proven
+        against = NO_SENSOR if residual <= 1 else self._isolate(climb, rise, wrong_gain)
         for role, counter in self.counters.items():
-            count(counter, seconds, role in against, len(against) > 1)
+            counter.update(seconds, role in against, disputed=len(against) > 1)
         if not against and not self.faulty:
             for pair, _ in known:
                 pair.learn(distance)
+
+    def _isolate(self, climb: float | None, rise: float | None, wrong_gain: bool) -> frozenset[str]:
+        """Sensors that explain a contradiction, of those that tell a climb [m]."""
+        if rise is None or wrong_gain:
+            return ACCELEROMETER
+        if climb is None:
+            return ALTITUDE
+        by_energy = (self._energy_inertial.unusual, self._energy_altitude.unusual)
+        wrong = isolate(*((off / CONFIG.energy_decides_sd) ** 2 for off in by_energy))
+        return (ACCELEROMETER | ALTITUDE, ACCELEROMETER, ALTITUDE)[wrong]
 
     @property
     def faulty(self) -> frozenset[str]:

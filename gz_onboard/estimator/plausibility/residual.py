@@ -171,9 +171,13 @@ class FaultCounter:
         self.agreed = 0.0  # s of agreement since the last contradiction
         self.faulty = False
 
-    def update(self, dt: float, contradicts: bool | None) -> None:
-        """Add `dt` [s] of contradiction or agreement; None: there was nothing to compare the sensor with."""
+    def update(self, dt: float, contradicts: bool | None, disputed: bool = False) -> None:
+        """Add `dt` [s] of contradiction or agreement; None: there was nothing to compare the sensor with.
+
+        disputed: another sensor is as likely to be the cause. Waiting for what decides costs less than losing both.
+        """
         if contradicts:
+            dt = CONFIG.dispute_weight * dt if disputed else dt
             self.agreed = 0.0
             self.contradicted = min(self.contradicted + dt, CONFIG.faulty_after_s)
             self.faulty |= self.contradicted >= CONFIG.faulty_after_s
@@ -186,11 +190,6 @@ class FaultCounter:
 def faulty(counters: Mapping[str, FaultCounter]) -> frozenset[str]:
     """Roles whose sensors are faulty."""
     return frozenset(role for role, counter in counters.items() if counter.faulty)
-
-
-def count(counter: FaultCounter, dt: float, contradicts: bool | None, disputed: bool) -> None:
-    """Add `dt` [s] to a counter; less where two members contradict each other and nothing decides."""
-    counter.update(CONFIG.dispute_weight * dt if disputed else dt, contradicts)
 
 
 class UnchangedTimer:

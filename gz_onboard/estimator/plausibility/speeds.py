@@ -12,7 +12,6 @@ from gz_onboard.estimator.plausibility.residual import (
     ResidualTest,
     StepInputs,
     UnchangedTimer,
-    count,
 )
 from gz_onboard.estimator.signals import FIX_2D
 from gz_onboard.events import SPEEDS
@@ -131,7 +130,7 @@ class SpeedCheck:
         for role in speeds:
             against = role in outvoted | tied
             comparable = middle > CONFIG.moving_m_s and self._unchanged[role].seconds < CONFIG.stuck_s
-            count(self.counters[role], dt, against if against or comparable else None, role in tied)
+            self.counters[role].update(dt, against if against or comparable else None, role in tied)
             step.signals[role].trusted = not (self.counters[role].faulty or role in outvoted)
 
     def _follow_wheelspin(self, dt: float, speeds: Mapping[str, float]) -> bool:
