@@ -44,19 +44,20 @@ def ridden(
     watch: SpeedCheck | None = None,
     begin: float = 0.0,
     each: Each = lambda t, signals, speeds: None,
+    dt: float = STEP,
 ) -> tuple[SpeedCheck, Signals]:
     """`seconds` of riding; a fault makes of (time [s], true value) what is reported, None being nothing; each: step."""
     signals = Signals((role, 2.0) for role in ROLES)
     speeds = watch or SpeedCheck(RADIUS, GEAR, CAPACITY)
-    for step in range(round(seconds / STEP)):
-        t = begin + step * STEP
+    for step in range(round(seconds / dt)):
+        t = begin + step * dt
         for role in roles:
             value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
             value = faults[role](t, value) if role in faults and value is not None else value
             if value is not None:
                 signal = signals[role]
                 signal.value, signal.time, signal.total, signal.count = value, t, value, 1
-        speeds.step(StepInputs(t, STEP, STEP, signals, None))
+        speeds.step(StepInputs(t, dt, dt, signals, None))
         each(t, signals, speeds)
         signals.next_step()
     return speeds, signals
@@ -74,10 +75,14 @@ FAULTS: dict[str, Fault] = {
 }
 
 
+WINDOWS = pytest.mark.parametrize("dt", [STEP, 0.5])  # s: checks count seconds, not steps
+
+
+@WINDOWS
 @pytest.mark.parametrize("name", FAULTS)
 @pytest.mark.parametrize("wrong_role", FOUR)
-def test_one_of_four_that_is_wrong_is_named_and_left_out(wrong_role: str, name: str):
-    speeds, signals = ridden(60.0, FOUR, {wrong_role: FAULTS[name]})
+def test_one_of_four_that_is_wrong_is_named_and_left_out(wrong_role: str, name: str, dt: float):
+    speeds, signals = ridden(60.0, FOUR, {wrong_role: FAULTS[name]}, dt=dt)
     assert faulty(speeds.counters) == {wrong_role}
     assert not signals[wrong_role].trusted
     assert all(signals[role].trusted for role in FOUR if role != wrong_role)
@@ -274,18 +279,19 @@ def hills(
     power: bool = True,
     on_road: bool = True,
     begin: float = 300.0,
+    dt: float = STEP,
 ) -> GradeCheck:
     """Riding over hills of 4 %, stopping now and then; the faults begin at `begin` [s]."""
     signals, grades, speeds = grade_check()
     distance, before, height = 0.0, town(0.0), 200.0
-    for step in range(round(seconds / STEP)):
-        t = step * STEP
+    for step in range(round(seconds / dt)):
+        t = step * dt
         speed = town(t)
         grade = 0.04 * cos(distance / 120.0)
-        acceleration = (speed - before) / STEP
+        acceleration = (speed - before) / dt
         before = speed
-        distance += speed * STEP
-        height += grade * speed * STEP
+        distance += speed * dt
+        height += grade * speed * dt
         honest = {
             "accel_x": acceleration + GRAVITY * (grade + MOUNTED) + 0.1 * sin(77 * t),
             "gps_altitude": height + sin(t / 60),
@@ -297,16 +303,17 @@ def hills(
             if value is not None:
                 signals[role].value, signals[role].time = value, t
         work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
-        grades.step(StepInputs(t, STEP, STEP, signals, speed))
+        grades.step(StepInputs(t, dt, dt, signals, speed))
         speeds.median, speeds.on_road, signals.motor_speed.time = speed, on_road, t
-        grades.compare(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
+        grades.compare(t, dt, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
     return grades
 
 
-def test_hills_wind_and_a_tilted_accelerometer_are_no_faults():
+@WINDOWS
+def test_hills_wind_and_a_tilted_accelerometer_are_no_faults(dt: float):
     for roles in (GRADES, GRADES[:1], GRADES[1:]):
-        assert hills(1500.0, {}, roles).faulty == NO_SENSOR
-        assert hills(1500.0, {}, roles, power=False).faulty == NO_SENSOR
+        assert hills(1500.0, {}, roles, dt=dt).faulty == NO_SENSOR
+        assert hills(1500.0, {}, roles, power=False, dt=dt).faulty == NO_SENSOR
 
 
 GRADE_FAULTS: dict[str, tuple[str, Fault]] = {
@@ -324,10 +331,11 @@ GRADE_FAULTS: dict[str, tuple[str, Fault]] = {
 }
 
 
+@WINDOWS
 @pytest.mark.parametrize("name", GRADE_FAULTS)
-def test_a_wrong_sensor_of_the_grade_is_named_by_the_energy(name: str):
+def test_a_wrong_sensor_of_the_grade_is_named_by_the_energy(name: str, dt: float):
     role, fault = GRADE_FAULTS[name]
-    assert hills(800.0, {role: fault}).faulty == {role}
+    assert hills(800.0, {role: fault}, dt=dt).faulty == {role}
 
 
 def test_without_the_energy_neither_is_believed():

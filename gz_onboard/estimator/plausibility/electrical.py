@@ -107,10 +107,8 @@ class PackSensors:
         signals, parameters = self._signals, self._parameters
         voltage, inverter_voltage = signals.pack_voltage.reported(now), signals.inverter_voltage.reported(now)
         pack, inverter = signals.pack_current.reported(now), signals.inverter_current.reported(now)
-        auxiliary, any_voltage = (
-            signals.auxiliary_current.reported(now),
-            inverter_voltage if voltage is None else voltage,
-        )
+        auxiliary = signals.auxiliary_current.reported(now)
+        any_voltage = inverter_voltage if voltage is None else voltage
         usual = parameters["auxiliary_power"] / (any_voltage or self._usual_voltage)
         extra = 0.0 if auxiliary is None else auxiliary - usual
         standing = abs(speed or 0.0) < CONFIG.standstill_m_s
@@ -130,9 +128,10 @@ class PackSensors:
         if inverter_voltage is not None:
             voltages["inverter_voltage"] = inverter_voltage + parameters["cable_resistance"] * (current or 0.0)
         idle = standing and (inverter is None or abs(inverter) <= usual)
+        chosen = self._choose_voltage(dt, voltages, current, idle, evidence)
         both = signals.pack_current.fresh(now) and signals.inverter_current.fresh(now)
         return PackReading(
-            self._choose_voltage(dt, voltages, current, idle, evidence),
+            chosen,
             current,
             source,
             next(iter(currents.values()), None),
