@@ -245,6 +245,76 @@ def pack_sensors(roles: tuple[str, ...]) -> tuple[PackSensors, Signals]:
     return PackSensors(signals, VEHICLE.pack, VEHICLE.parameters), signals
 
 
+REST_VOLTAGE, RESISTANCE, LOAD = 52.0, 0.066, 1.0  # V, ohm, A: of the pack, and of what is always on
+ELECTRICAL = ("pack_current", "inverter_current", "auxiliary_current", "pack_voltage", "inverter_voltage")
+
+
+def driven(
+    dt: float, faults: Mapping[str, Fault], seconds: float = 120.0, resistance: float = RESISTANCE
+) -> PackSensors:
+    """Riding with full throttle and none; the faults begin after a minute. resistance: what the cell model believes."""
+    check, signals = pack_sensors(ELECTRICAL)
+    series, rms, power = VEHICLE.pack.cells_series, 0.0, 0.0
+
+    def error(volts: float, current: float, sensor: str) -> float:
+        return (volts - REST_VOLTAGE + resistance * current) / series
+
+    def road_power() -> float:
+        return power
+
+    for step in range(round(seconds / dt)):
+        t = step * dt
+        inverter = 20.0 * (1 + sin(t)) if t % 40 < 30 else 0.0
+        true = {"pack_current": inverter + LOAD, "inverter_current": inverter, "auxiliary_current": LOAD}
+        voltage = REST_VOLTAGE - RESISTANCE * true["pack_current"]
+        cable = VEHICLE.parameters["cable_resistance"] * true["pack_current"]
+        true |= {"pack_voltage": voltage, "inverter_voltage": voltage - cable}
+        for role, value in true.items():
+            fault = faults.get(role) if t >= 60.0 else None
+            signals[role].value, signals[role].time = (fault(t, value) or 0.0) if fault else value, t
+        power = voltage * true["pack_current"]
+        reading = check.read(t, dt, 10.0 if inverter else 0.0, CellEvidence(error, road_power, rms))
+        used = signals.pack_current.value if reading.current is None else reading.current
+        check.sag.update(dt, voltage / series, RESISTANCE * used / series)
+        rms += (abs(error(voltage, used, "")) - rms) * dt / 10.0
+    return check
+
+
+@WINDOWS
+@pytest.mark.parametrize("resistance", [0.7 * RESISTANCE, RESISTANCE, 1.5 * RESISTANCE])
+def test_healthy_electrical_sensors_are_believed_whatever_the_age_of_the_pack(dt: float, resistance: float):
+    assert faulty(driven(dt, {}, 300.0, resistance).counters) == NO_SENSOR
+
+
+CURRENT_LIES: dict[str, Fault] = {
+    "zero": lambda t, v: 0.0,
+    "doubled": lambda t, v: 2 * v,
+    "reversed": lambda t, v: -v,
+    "5 A off": lambda t, v: v + 5.0,
+}
+VOLTAGE_LIES: dict[str, Fault] = {"zero": lambda t, v: 0.0, "low": lambda t, v: v - 3.0, "high": lambda t, v: v + 3.0}
+ELECTRICAL_FAULTS: dict[str, tuple[str, Fault]] = {
+    f"{role} {name}": (role, fault)
+    for roles, lies in ((ELECTRICAL[:2], CURRENT_LIES), (ELECTRICAL[3:], VOLTAGE_LIES))
+    for role in roles
+    for name, fault in lies.items()
+} | {"auxiliary_current 20 A off": ("auxiliary_current", lambda t, v: v + 20.0)}
+
+
+@WINDOWS
+@pytest.mark.parametrize("name", ELECTRICAL_FAULTS)
+def test_a_wrong_electrical_sensor_is_named_and_no_other(name: str, dt: float):
+    role, fault = ELECTRICAL_FAULTS[name]
+    assert faulty(driven(dt, {role: fault}).counters) == {role}
+
+
+@WINDOWS
+@pytest.mark.parametrize("name", ["zero", "doubled", "reversed"])
+def test_currents_that_agree_on_a_lie_are_both_left_out(name: str, dt: float):
+    both = dict.fromkeys(ELECTRICAL[:2], CURRENT_LIES[name])
+    assert faulty(driven(dt, both).counters) == set(both)
+
+
 @pytest.mark.parametrize("roles", [("pack_current",), ("pack_current", "inverter_current")])
 def test_a_current_that_cells_and_road_contradict_is_left_out(roles: tuple[str, ...]):
     """Only sensors that the vehicle has are named."""
