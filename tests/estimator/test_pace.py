@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 OFFSET, GAIN = VEHICLE.parameters["pack_current_offset"], VEHICLE.parameters["pack_current_gain"]
@@ -16,7 +16,7 @@ OFFSET, GAIN = VEHICLE.parameters["pack_current_offset"], VEHICLE.parameters["pa
 def test_a_step_has_the_pack_of_its_own_time(period):
     """A row of a table: all at one time, the voltage last. Speed and current of a step belong together."""
     groups = [Group(role, (role,), period) for role in ("vehicle_speed", "pack_current", "pack_voltage")]
-    e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for i in range(20):
         now = i * period
         for group, value in enumerate((5.0 + i * 0.1, OFFSET + GAIN * i, 54.0)):
@@ -30,7 +30,7 @@ def test_a_step_has_the_pack_of_its_own_time(period):
 def test_a_row_is_one_step_whatever_comes_first_in_it(monkeypatch, period, jitter):
     """Periods that the sender holds to a microsecond, too: none of the usual ones is between fast and slow."""
     roles = "pack_current", "vehicle_speed", "inverter_current", "pack_voltage"
-    e = Estimator([Group(role, (role,), period) for role in roles], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator([Group(role, (role,), period) for role in roles], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     steps, step = [], e._step
 
     def counted(now):
@@ -47,7 +47,7 @@ def test_a_row_is_one_step_whatever_comes_first_in_it(monkeypatch, period, jitte
 
 def test_without_the_pack_steps_are_made_all_the_same():
     groups = [Group(role, (role,), 0.5) for role in ("vehicle_speed", "pack_current", "pack_voltage")]
-    e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for i in range(40):
         for group, value in enumerate((5.0 + i * 0.1, 10.0, 54.0)):
             if group == 0 or i < 20:

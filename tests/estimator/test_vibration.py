@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.vibration import SETTLED, STUCK, VibrationMonitor
 from gz_onboard.events import Group
@@ -23,6 +22,7 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
+from tests.events import EventEstimator
 from tests.support import ridden, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
@@ -135,7 +135,7 @@ def events(seconds, vibration, lost=lambda t: False):
 
 
 def estimated(vehicle, rows, groups=SHAKEN):
-    e = Estimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
+    e = EventEstimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
     for event in rows:
         e.handle(event)
     return e

@@ -25,6 +25,7 @@ from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle
+from tests.events import events_of
 from tests.support import ROOT, reference, ridden
 
 NONE = Dropouts(frames=0.0, gps_gap_every=0.0)
@@ -57,7 +58,7 @@ def estimated():
 def column(role, all_frames=None):
     """(times [s since the start], values) of a role as the codec decodes it."""
     codec = Codec(reference().mapping)
-    found = codec.decode(all_frames or frames())
+    found = events_of(codec, all_frames or frames())
     shift = ((all_frames or frames())[0][0] - START_NS) * 1e-9
     rows = [
         (time + shift, values[codec.groups[group].roles.index(role)])
