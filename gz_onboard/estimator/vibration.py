@@ -9,6 +9,7 @@ from gz_onboard.events import WINDOW
 from gz_onboard.physics.vibration import FAST, SLOW
 
 SETTLED = 3 * SLOW  # s of samples before there is a value: 97 % of it is there
+STILL = 1e-6  # (m/s²)²: less is a stuck sensor's, and rounding
 FEWEST = WINDOW / 0.034  # samples in a window: a slower sensor does not show what a road does to a wheel
 
 
@@ -29,7 +30,7 @@ class VibrationMonitor:
             return
         square = (accel_z.mean_square - mean * mean) * n / (n - 1)
         dt = now - self._time
-        if square <= 0 or dt > 2 * WINDOW:
+        if square < STILL or dt > 2 * WINDOW:
             self._since, self._square = now, max(square, 0.0)
         keep = exp(-WINDOW / n / FAST)  # of white shaking, `Vibration` shows this share
         self._square += (1 - exp(-min(dt, WINDOW) / SLOW)) * (square * keep * keep * 2 / (1 + keep) - self._square)

@@ -72,7 +72,9 @@ def test_identifiers_of_29_bits_are_exact_whatever_the_bus(tmp_path: Path, bus: 
     assert (battery.request, battery.response) == (0x18DA10F1 | EFF_FLAG, 0x18DAF110 | EFF_FLAG)
     for identifier, expected in ((0x18DAF110 | EFF_FLAG, 1), (0x18DAF111 | EFF_FLAG, 0), (0x110, 0)):
         parts = enumerate(carried(payload(battery, **STEADY)))
-        assert len(events_of(Codec(vehicle.mapping), [(EPOCH + i * MS, identifier, d, 0) for i, d in parts])) == expected
+        assert (
+            len(events_of(Codec(vehicle.mapping), [(EPOCH + i * MS, identifier, d, 0) for i, d in parts])) == expected
+        )
 
 
 def test_addresses_in_the_first_byte(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Steps are made with the message of the pack, also where that comes seldom."""
+"""Speed and current of a step belong together, however often they come."""
 
 from __future__ import annotations
 
@@ -23,26 +23,6 @@ def test_a_step_has_the_pack_of_its_own_time(period):
             e.handle((now, group, (value,)))
         assert e.estimate(now).pack_current == pytest.approx(i)
         assert e.estimate(now).speed == pytest.approx(5.0 + i * 0.1)
-
-
-@pytest.mark.parametrize("period", [0.1, 0.2, 0.5, 1.0, 2.0])
-@pytest.mark.parametrize("jitter", [0.0, 1e-7, 0.01])
-def test_a_row_is_one_step_whatever_comes_first_in_it(monkeypatch, period, jitter):
-    """Periods that the sender holds to a microsecond, too: none of the usual ones is between fast and slow."""
-    roles = "pack_current", "vehicle_speed", "inverter_current", "pack_voltage"
-    e = EventEstimator([Group(role, (role,), period) for role in roles], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
-    steps, step = [], e._step
-
-    def counted(now):
-        steps.append(now)
-        step(now)
-
-    monkeypatch.setattr(e, "_step", counted)
-    for i in range(200):
-        now = i * period + jitter * (i % 3)
-        for group, value in enumerate((OFFSET + GAIN * 5.0, 5.0, 5.0, 54.0)):
-            e.handle((now, group, (value,)))
-    assert len([time for time in steps if round(time / period) > 20]) == 179
 
 
 def test_without_the_pack_steps_are_made_all_the_same():
