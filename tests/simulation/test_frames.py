@@ -15,7 +15,7 @@ from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.parts.road import Dynamometer
@@ -93,7 +93,7 @@ def test_the_estimate_is_the_truth():
     assert abs(np.mean(errors)) < 0.05
     assert np.abs(errors).max() < 0.1
     assert last.consumption_factor == pytest.approx(1.0, abs=0.1)
-    energy = sum(e.pack_voltage * e.pack_current * 0.1 for e in run.estimates if e.pack_current is not None)
+    energy = sum(e.pack_voltage * e.pack_current * WINDOW for e in run.estimates if e.pack_current is not None)
     assert energy == pytest.approx(ride()[0].energy, rel=0.01)
 
 
