@@ -13,7 +13,7 @@ from gz_onboard.estimator.plausibility.inertial import GradeCheck
 from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, StepInputs, faulty
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck, vote
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import ROLES
+from gz_onboard.events import ROLES, RoleWindow
 from gz_onboard.vehicle import read_vehicle
 
 RADIUS, GEAR, CAPACITY = 0.25, 0.5, 30.0  # m; wheel speed over motor speed; Ah
@@ -55,11 +55,10 @@ def ridden(
             value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
             value = faults[role](t, value) if role in faults and value is not None else value
             if value is not None:
-                signal = signals[role]
-                signal.value, signal.time, signal.total, signal.count = value, t, value, 1
+                signals[role].take(RoleWindow(t, value, 1, value))
         speeds.step(StepInputs(t, dt, dt, signals, None))
         each(t, signals, speeds)
-        signals.next_step()
+        signals.next_window()
     return speeds, signals
 
 
