@@ -190,40 +190,36 @@ class OdometerTest:
         self._heard = float("-inf")  # s, the last message of the odometer
         self.restart(None)
 
-    def restart(self, value: float | None) -> None:
+    def restart(self, value: float | None, counts: int = -1) -> None:
         """Start a comparison at an odometer reading [m]; None: not all of the way is known by a single speed."""
-        self._value = value  # m, at the last count
-        self._counts: list[tuple[float, float]] = []  # m by odometer and by speed, of each count
-        self._ridden = self._waited = 0.0  # m by speed and s since the last count
-        self._partial = True  # the first count began before the comparison
+        self._value, self._counts = value, counts  # m, at the last count; the first count has begun before
+        self._counted = self._ridden = 0.0  # m by odometer and by speed, up to the last count
+        self._since = self._waited = 0.0  # m by speed and s since then
 
     def step(self, step: StepInputs, speed: float, stuck: bool) -> bool | None:
         """Whether the two contradict each other, where a comparison at a speed [m/s] ends; otherwise None."""
         signal = step.signals.odometer
         heard, self._heard = self._heard, signal.time
-        self._ridden += speed * step.observed
+        self._since += speed * step.observed
         self._waited += step.observed
         if self._value is None or step.now - heard > CONFIG.odometer_silence_s or step.observed < step.dt:
             self.restart(signal.value)
-        count = signal.value - (self._value or 0.0)
-        largest = max((counted for counted, _ in self._counts), default=0.0)
-        stalled = largest and self._ridden > CONFIG.odometer_unit_ratio * largest + CONFIG.odometer_late_m
-        if count < 0 or count > CONFIG.fastest_m_s * self._waited + CONFIG.odometer_late_m or stalled:
+        count, late = signal.value - (self._value or 0.0), CONFIG.odometer_late_m
+        usual = self._counted / max(self._counts, 1)
+        stalled = usual and self._since > CONFIG.odometer_unit_ratio * usual + late
+        if count < 0 or count > CONFIG.fastest_m_s * self._waited + late or stalled:
             self.restart(signal.value)
-        elif count > 0:
-            return self._add(signal.value, count, stuck)
-        return None
-
-    def _add(self, value: float, count: float, stuck: bool) -> bool | None:
-        if not self._partial:
-            self._counts.append((count, self._ridden))
-        self._partial, self._value, self._ridden, self._waited = False, value, 0.0, 0.0
-        counted, ridden = (sum(column) for column in zip(*self._counts, strict=True)) if self._counts else (0.0, 0.0)
-        if counted < CONFIG.odometer_stretch_m or len(self._counts) < 3:
+        if count <= 0 or self._value == signal.value:
             return None
-        largest, more, less = max(self._counts)[0], max(counted, ridden), min(counted, ridden)
-        self._counts = []
-        contradicts = more - less > max(CONFIG.odometer_sd * more, largest)
-        if contradicts:
-            self.compared = ridden
+        self._counts += 1
+        if self._counts > 0:
+            self._counted += count
+            self._ridden += self._since
+        self._value, self._since, self._waited = signal.value, 0.0, 0.0
+        more, less = max(self._counted, self._ridden), min(self._counted, self._ridden)
+        if self._counted < CONFIG.odometer_stretch_m or self._counts < 3:
+            return None
+        contradicts = more - less > max(CONFIG.odometer_sd * more, self._counted / self._counts)
+        self.compared = self._ridden if contradicts else self.compared
+        self.restart(signal.value, counts=0)
         return contradicts if stuck or more < CONFIG.odometer_unit_ratio * less else None
