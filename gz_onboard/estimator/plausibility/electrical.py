@@ -129,13 +129,15 @@ class PackSensors:
             voltages["inverter_voltage"] = inverter_voltage + parameters["cable_resistance"] * (current or 0.0)
         idle = standing and (inverter is None or abs(inverter) <= usual)
         chosen = self._choose_voltage(dt, voltages, current, idle, evidence)
+        # Beyond agreement, neither voltage is known better than the residual of the two [sd].
+        unproven = max(sqrt(self._voltage_difference.square) - CONFIG.agreeing_residual, 0.0)
         both = signals.pack_current.fresh(now) and signals.inverter_current.fresh(now)
         return PackReading(
             chosen,
             current,
             source,
             next(iter(currents.values()), None),
-            hypot(self._voltage_sd, self.voltage_dispute, CONFIG.voltage_sd_v * self._unproven_voltage),
+            hypot(self._voltage_sd, self.voltage_dispute, CONFIG.voltage_sd_v * unproven),
             self._offset.difference if both and now - self._compared < CONFIG.current_offset_time_s else None,
             bool(self.voltage_dispute or faulty(self.counters) & set(VOLTAGES)),
         )
@@ -261,11 +263,6 @@ class PackSensors:
             for role, voltage in voltages.items():
                 self._by_cells[role].update(dt, error(voltage, current, "chosen") or 0.0, usual)
         return self._isolated(*VOLTAGES)
-
-    @property
-    def _unproven_voltage(self) -> float:
-        """Residual of the two voltages beyond agreement, in standard deviations: no better is either of them known."""
-        return max(sqrt(self._voltage_difference.square) - CONFIG.agreeing_residual, 0.0)
 
 
 def together(first: Signal, second: Signal) -> bool:
