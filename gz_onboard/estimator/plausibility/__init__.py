@@ -3,7 +3,7 @@
 Each group (speeds; currents and voltages; inertial unit and altitude; temperatures) predicts a member from the others,
 from a model or from the member's own past. The normalised residual goes into a fault counter per sensor. A sensor that
 explains the contradiction is left out at once, and is faulty after `faulty_after_s` until it has agreed for
-`recovered_after_s`. Two members that contradict each other with nothing to decide are disputed: none of them is
+`recovered_after_s`. Two members that contradict each other with nothing to decide are disputed: neither is
 believed alone, and the uncertainty grows.
 
 A sensor that is left out counts as silent (`Signal.trusted`). Import from the modules of this package.

@@ -36,7 +36,7 @@ CellError = Callable[[float, float, str], float | None]
 
 
 class CellEvidence(NamedTuple):
-    """What the models know of the pack's current and voltage."""
+    """Evidence of the cell model and the road load about the pack's current and voltage."""
 
     error: CellError
     road_power: Callable[[], float | None]  # W of the pack; None while the motion is unknown
@@ -53,7 +53,7 @@ class VoltageSag:
 
     def update(self, dt: float, voltage: float, drop: float) -> None:
         """Add the voltage of a cell and the drop that the current explains [V], `dt` [s] after the last."""
-        if self._voltage is None or dt > CONFIG.sag_fast_s:  # what came between is unknown
+        if self._voltage is None or dt > 2 * CONFIG.sag_fast_s:  # after a gap
             self._voltage, self._drop = voltage, drop
             return
         change, explained = voltage - self._voltage, drop - self._drop

@@ -118,7 +118,7 @@ class StepInputs(NamedTuple):
 
 
 def share_of_new(dt: float, time: float) -> float:
-    """Weight of a value that stands for `dt` in a mean over `time`; both in seconds or in metres."""
+    """Weight of a value that represents `dt` in a mean over `time`; both in seconds or in metres."""
     return min(dt / time, 1.0) if time > 0 else 1.0
 
 
