@@ -290,8 +290,7 @@ def is_fresh(daemon: Daemon) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
-    [(foreign, "['another scooter', '10s4p'] saved"), (other_version, "is of version 99")],
+    ("spoil", "said"), [(foreign, "['another scooter', '10s4p'] saved"), (other_version, "is of version 99")]
 )
 def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str

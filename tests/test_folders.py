@@ -95,27 +95,6 @@ def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: py
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("folders")
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["run", FULL], "run takes files and folders behind its options only: --vehicle NAME|TOML, "),
-        (["run", "a.blf.gz"], "; a recorded ride is for estimate, or for replay onto a bus"),
-        (["learned", FULL], "learned takes files and folders behind its options only: --vehicle NAME|TOML, --json"),
-        (["learned", "scooter.json"], "--state FILE\n"),
-        (["foxglove", FULL], "--vehicle NAME|TOML, --write-layout FILE; a recorded ride is for estimate, or for"),
-    ],
-)
-def test_a_command_without_files_says_where_they_go(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(arguments)
-    told = capsys.readouterr().err
-    assert said in told
-    assert "before the options" not in told
-
-
 def test_the_page_of_the_commands_has_them() -> None:
     text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     section = text.partition("\n## Folders")[2].partition("\n## ")[0]

@@ -46,8 +46,8 @@ FORBIDDEN = {
 
 OFFLINE = ("offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
-# Imported only when asked for, or for types: the reference filter behind --filter filterpy, arrays.
-ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
+# Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
+ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py", "bridges/broker.py"}
 
 # The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
 # that stand before it.

@@ -1,7 +1,7 @@
-"""What a broker is told: the values by name, and how Home Assistant finds and shows them.
+"""Messages for a broker: the values by name, and the discovery message of Home Assistant.
 
-One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, with nothing in it: the
-broker keeps no number of a vehicle that is gone.
+One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, without values, so that
+the broker keeps no number of a vehicle that is gone.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from gz_onboard.dashboard.picture import ALERTS, Picture
 from gz_onboard.events import Activity, State
 
 ONLINE, OFFLINE = "online", "offline"
-NONE = "none"  # of alerts and reasons, when all is well
+NONE = "none"  # alert and reasons when all is well
 LONGEST = 255  # characters that Home Assistant takes as a state
-EXPIRES = 30  # s: a state that is older is no longer one of now, to the broker and to Home Assistant
+EXPIRES_S = 30  # after which the broker drops a state, and Home Assistant shows none
 PREFIX = "homeassistant"  # where it looks, unless it is configured otherwise
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """One value. kind: Home Assistant's device class; options: all that a text may be."""
+    """One value. kind: Home Assistant's device class; options: the possible texts."""
 
     name: str
     kind: str | None = None
     unit: str | None = None
     options: tuple[str, ...] = ()
-    digits: int | None = None  # that are shown
+    digits: int | None = None  # shown after the point
     diagnostic: bool = False
-    total: bool = False  # it only grows, so that Home Assistant can make days and months of it
+    total: bool = False  # only grows, so that Home Assistant can sum days and months
 
 
 def _km(name: str) -> Sensor:
@@ -69,21 +69,21 @@ SENSORS = {
     "alert": Sensor("Alert", "enum", options=(NONE, *ALERTS)),
     "reasons": Sensor("Reasons", diagnostic=True),
 }
-"""By the names that they have in the state."""
+"""By their names in the state."""
 
 
 def topic_of(name: str) -> str:
-    """Where the state of the vehicle `name` is."""
+    """Topic of the state of the vehicle `name`."""
     return f"gz-onboard/{name}/state"
 
 
 def discovery_topic(name: str) -> str:
-    """Where Home Assistant learns of it."""
+    """Topic of its discovery message."""
     return f"{PREFIX}/device/gz-onboard-{name}/config"
 
 
 def state_of(picture: Picture, status: str) -> dict[str, object]:
-    """The values of a picture by name, None for what is stale, not available or never came."""
+    """Return the values of a picture by name; None if stale, not available or never received."""
     charge, route, cells = picture.charge, picture.route, picture.cells
     return {
         "status": status,
@@ -112,19 +112,19 @@ def state_of(picture: Picture, status: str) -> dict[str, object]:
 
 
 def _joined(reasons: Sequence[str]) -> str:
-    """As many as fit into a state."""
+    """Join as many as fit into a state."""
     while len(text := ", ".join(reasons)) > LONGEST:
         reasons = reasons[:-1]
     return text or NONE
 
 
 def encoded(values: dict[str, object]) -> bytes:
-    """As one line of JSON."""
+    """Encode as one line of JSON."""
     return json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
 
 
 def discovery(name: str) -> dict[str, object]:
-    """What Home Assistant is told of the vehicle `name`: one device, and its sensors."""
+    """Return the discovery message for the vehicle `name`: one device with its sensors."""
     return {
         "device": {"identifiers": [f"gz-onboard-{name}"], "name": name, "manufacturer": "gz_onboard"},
         "origin": {"name": "gz-onboard", "sw_version": __version__},
@@ -134,7 +134,7 @@ def discovery(name: str) -> dict[str, object]:
 
 
 def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
-    """A sensor, available only while somebody is there who says it, and while there is something to say."""
+    """Describe a sensor, which is available only while the bridge is online and the value is known."""
     there = f"value_json.status == '{ONLINE}' and value_json.{key} is not none"
     about: dict[str, object] = {
         "platform": "sensor",
@@ -149,7 +149,7 @@ def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
                 "payload_not_available": OFFLINE,
             }
         ],
-        "expire_after": EXPIRES,
+        "expire_after": EXPIRES_S,
     }
     if sensor.kind:
         about["device_class"] = sensor.kind

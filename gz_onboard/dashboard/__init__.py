@@ -1,1 +1,1 @@
-"""What the rider sees."""
+"""The range for the rider: in a terminal and on a web page."""
