@@ -31,6 +31,7 @@ from hypothesis import strategies as st
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.completion import is_complete
+from gz_onboard.bus.library_bus import LibraryBus
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.cli import main
@@ -507,8 +508,8 @@ def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.Monke
     daemon = Daemon(reference(), [left, right], recorder=None, state_file=None)
     taken: list[Frame] = []
     monkeypatch.setattr(daemon, "step", lambda frames, now_ns: taken.extend(frames))
-    monkeypatch.setattr(left, "up", True)
-    monkeypatch.setattr(right, "up", True)
+    left.open()
+    right.open()
     came = [(time.time_ns() - (60 - i) * 1_000_000, 0x123, b"", i % 2) for i in range(60)]
 
     def parts(channel: CanChannel, of: list[Frame], count: int):
@@ -584,7 +585,8 @@ def test_a_bus_that_never_runs_dry_does_not_silence_it(bus: str, monkeypatch: py
     with Scene(bus) as scene:
         message = can.Message(arbitration_id=0x413, data=bytes(2), is_extended_id=False)
         (channel,) = scene.daemon.channels
-        monkeypatch.setattr(channel._bus, "recv", lambda timeout: message)
+        assert isinstance(channel._bus, LibraryBus)
+        monkeypatch.setattr(channel._bus._bus, "recv", lambda timeout: message)
         begin = len(scene.heard)
         time.sleep(3.0)
         heard = scene.heard[begin:]
@@ -826,7 +828,7 @@ def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
         daemon.step(frames[half + 1 :], frames[-1][0])  # so soon after the first it is not saved
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr(daemon, "round", broken)
+    monkeypatch.setattr(daemon, "tick", broken)
     with pytest.raises(RuntimeError, match="unforeseen"):
         daemon.run()
     (path,) = recorder.paths

@@ -53,7 +53,7 @@ MORE = [
     (["vehicle", "check", FULL, RIDE], "FULL: is a folder; the vehicle comes first, by name or file, then its logs"),
     (["vehicle", "check", FULL, "v.toml"], "FULL: is a folder; the vehicle comes first, by name or file, then its"),
     (["vehicle", "check", "a.blf.gz", "v.toml"], "a.blf.gz: is a log; the vehicle comes first"),
-    (["vehicle", "check", "vehicles", RIDE], "is a folder; give the vehicle file in it, such as vehicles/v.toml"),
+    (["vehicle", "check", "vehicles", RIDE], "is a folder; give a vehicle file, which ends in .toml"),
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
     (["plot", FULL, "one.png"], "one.png: of a folder, each picture has the name of its log; leave it out"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--log-total-mb", type=number("--log-total-mb", *LOG_TOTAL_MB, "MB"), default=2048, metavar="MB", help=total)
     add("--state-dir", type=Path, default=states, metavar="DIR", help="folder for the saved state (default: none)")
     rider = "name of the rider; habits are learned per rider (default: the last one, or a signal of the bus)"
-    add("--rider", type=_rider, default="", metavar="NAME", help=rider)
+    add("--rider", type=_rider, metavar="NAME", help=rider)
     control = "socket on which `gz-onboard route` gives a route (default: none)"
     path = runtime / SOCKET.name if runtime else None
     add("--control-socket", type=Path, default=path, metavar="PATH", help=control)
@@ -112,7 +112,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         saved,
         filter_name=arguments.filter,
         control_socket=arguments.control_socket,
-        rider=arguments.rider,
+        rider=arguments.rider or "",
     )
     daemon.control.start()
     if route:
