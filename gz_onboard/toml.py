@@ -126,7 +126,7 @@ class Table:
         return tuple(self._number_of(number, key, low, high) for number in numbers)
 
     def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
-        """Return the list of rows of `columns` numbers `key`, each within [low, high]; `of` says what they are."""
+        """Return the list of rows of `columns` numbers `key`, each within [low, high]; `of` names them."""
         rows = self._list(key, "must be a list of rows of numbers")
         for row in rows:
             if not isinstance(row, list) or len(row) != columns:

@@ -121,7 +121,7 @@ class Vehicle:
 def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
     """Find the vehicle file `name`: a built-in vehicle, or a path, which has a slash or ends in ``.toml``.
 
-    beside: the folder that the path is relative to; default: the working directory. InputError if there is none.
+    beside: the folder to which the path is relative; default: the working directory. InputError if there is none.
     """
     built_in = sorted(file.stem for file in OWN.glob("*.toml"))
     path = (beside or Path()) / name
@@ -214,7 +214,7 @@ def _name(table: Table) -> str:
 
 
 def _healthy(table: Table) -> Path | None:
-    """Find the file of what the discovery learned on healthy rides, relative to the vehicle file."""
+    """Find the discovery's file of healthy rides, relative to the vehicle file."""
     table.only(["file", "rides"])
     if "file" not in table.values:
         return None

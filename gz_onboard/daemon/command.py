@@ -1,4 +1,4 @@
-"""``gz-onboard run``: the daemon's options, its locks, and what it prints when it ends."""
+"""``gz-onboard run``: options, locks and closing summary of the daemon."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def _lock_taken(taken: InputError) -> Iterator[None]:
 
 
 def summary(pipeline: Pipeline) -> list[str]:
-    """Describe what was received, the last known numbers and the last state, as they were sent."""
+    """Describe the received frames, the last known numbers and the last state, as they were sent."""
     last, known, counts = pipeline.last, pipeline.last_known, pipeline.counts()
     lines = [
         f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "

@@ -10,9 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-import socket
 import socketserver
-import stat
 import threading
 from collections.abc import Callable, Mapping
 from math import isfinite
@@ -48,9 +46,10 @@ class Control:
         """Listen, if there is a path. InputError if that is impossible."""
         if self._path is None:
             return
-        _remove_stale_socket(self._path)
         before = os.umask(UMASK)  # the socket is never accessible to others, not even for a moment
         try:
+            if self._path.is_socket():  # of a daemon that has crashed: a running one holds the bus
+                self._path.unlink()
             self._server = _Server(str(self._path), self.answer)
         except OSError as error:
             raise InputError(f"{self._path}: cannot listen there: {error.strerror or error}") from error
@@ -178,21 +177,3 @@ def route_of_request(request: object) -> Route:
         raise InputError(f"route: has {count} points, must have at least {LEAST_ROWS}")
     values = {column: tuple(numbers) for column, numbers in columns.items()}
     return route_ahead_of(Columns(Path("route, point"), tuple(range(1, count + 1)), values), name)
-
-
-def _remove_stale_socket(path: Path) -> None:
-    """Remove the socket of a daemon that is gone. InputError if `path` is anything else."""
-    try:
-        if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path}: is not a socket, and was left alone")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
-            other.settimeout(1.0)
-            other.connect(str(path))
-    except FileNotFoundError:
-        return
-    except ConnectionRefusedError:
-        path.unlink(missing_ok=True)
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot listen there: {error.strerror or error}") from error
-    raise InputError(f"{path}: another gz-onboard run listens there; give each its own")

@@ -26,7 +26,7 @@ def state_file(directory: Path, vehicle: str) -> Path:
 
 
 class StateKeeper:
-    """Restores the estimator's state at start, and saves it on a thread of its own."""
+    """Restores the estimator's state at start, and saves it on a separate thread."""
 
     def __init__(self, file: Path, key: str) -> None:
         self.file = file
@@ -115,7 +115,7 @@ class StateKeeper:
 
 
 def _set_aside(copy: Path) -> str:
-    """Rename a copy that cannot be used; return how the message goes on."""
+    """Rename a copy that cannot be used; return the end of the message."""
     refused = copy.with_name(f"{copy.name}.refused")
     try:
         copy.replace(refused)

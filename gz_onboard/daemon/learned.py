@@ -1,4 +1,4 @@
-"""``gz-onboard learned``: show, or reset, what the daemon has learned of a vehicle and its riders."""
+"""``gz-onboard learned``: show or reset the daemon's knowledge of a vehicle and its riders."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show what was learned, after a reset if one is asked for. InputError for a state that cannot be used."""
+    """Reset parts of a state, if asked for, and show it. InputError for a state that cannot be used."""
     vehicle = read_vehicle(arguments.vehicle, vehicle_id=arguments.vehicle_id)
     file = arguments.state or state_file(STATE_FOLDER, vehicle.name)
     not_an_input([arguments.json], [file, vehicle.file])
@@ -126,12 +126,12 @@ def _usable(file: Path) -> Iterator[None]:
 
 
 def battery_learned(estimator: Estimator) -> dict[str, Learned]:
-    """What was learned of the battery, by name; of the weakest group only if its voltage is on the bus."""
+    """Return the learned battery, by name; the weakest group only if its voltage is on the bus."""
     return estimator.soc.ageing.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
 
 
 def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
-    """What was learned of the riding, by rider and name; the last rider, whose part has the terrain, comes first."""
+    """Return the learned habits by rider and name; the last rider, whose part has the terrain, comes first."""
     forecaster = estimator.forecaster
     prior, terrain = forecaster.prior, forecaster.terrain
     riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
@@ -151,7 +151,7 @@ def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
 
 
 def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
-    """Describe what was learned, for a terminal. Unnamed riders are left out if nothing is known of them."""
+    """Describe the learned battery and riders for a terminal; an unnamed rider only if something is known."""
     lines = ["per cent learned: share of the initial uncertainty that is gone"]
     lines += [_line(name, x) for name, x in battery.items()]
     lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]

@@ -130,7 +130,7 @@ class Daemon:
         return snapshot
 
     def tick(self) -> int:
-        """Read and process what came since the last tick; return the number of frames."""
+        """Read and process the frames since the last tick; return their number."""
         boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frames, self._later = self._later, []
         read_until = []  # ns, of the channels with more to read

@@ -155,7 +155,7 @@ class Picture:
 
 
 def picture(view: View, now: float, source: tuple[str, str], up: bool, before: tuple[str, ...] = ()) -> Picture:
-    """Return what is known at `now` [s, on the clock of the view's frames].
+    """Return the picture at `now` [s, on the clock of the view's frames].
 
     source: (channel, interface); up: whether that bus is; before: the alerts of the last picture.
     """

@@ -21,7 +21,7 @@ AT_LEAST = 1.0  # s between two pictures though nothing has changed; without one
 
 
 def clock() -> float:
-    """Time since boot [s], suspended or not: what came before the board slept is old."""
+    """Time since boot [s], suspended or not: numbers from before the board slept are old."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 

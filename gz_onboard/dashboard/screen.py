@@ -1,4 +1,4 @@
-"""A picture as text: a screen for a terminal, or one line."""
+"""A picture as text, for a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gz_onboard.events import KEEPING, NO_SENSOR, Reason, cause_words, words
 
 @dataclass(frozen=True)
 class Style:
-    """What the terminal can show; without colour the texts themselves say everything."""
+    """Capabilities of the terminal; without colour the texts themselves say everything."""
 
     colour: bool
     unicode: bool
@@ -185,40 +185,3 @@ def _cropped(line: Line, width: int) -> Line:
 def rendered(line: Line, style: Style) -> str:
     """Turn a line into the text for the terminal."""
     return "".join(style.paint(text, codes) for text, codes in line)
-
-
-def summary_line(shown: Picture) -> str:
-    """Describe the picture on one line, for output that is no terminal."""
-    bad = shown.counts.bad
-    if not shown.heard:
-        return f"no frame of {shown.file}{f' but {bad} bad ones' if bad else ''}. {_NONE_YET}"
-    km = [_text(value, ".1f", "km") for value in (shown.range.km, shown.range.p10_km, shown.range.p90_km)]
-    soc, sigma = (_text(x, ".1f", "%") for x in (shown.battery.soc_percent, shown.battery.soc_sigma_percent))
-    recent, expected = (
-        _text(value, ".1f", "Wh/km")
-        for value in (shown.consumption.recent_wh_per_km, shown.consumption.expected_wh_per_km)
-    )
-    parts = [
-        f"range {km[0]} ({km[1]} to {km[2]})",
-        f"SOC {soc} ± {sigma}",
-        f"{_text(shown.battery.energy_left_wh, '.0f', 'Wh')} left",
-        f"{recent} recent, {expected} expected",
-        _WAITING if "waiting" in shown.alerts else shown.state or "state unknown",
-    ]
-    parts += [shown.activity] if shown.activity else []
-    parts += [_charge(shown.charge)] if shown.charge else []
-    if causes := _causes(shown):
-        parts.append(f"why, besides charge: {causes}")
-    kept, others = _reasons(shown)
-    because = "wider interval" if shown.state == "valid" else f"{shown.state or ''} because".lstrip()
-    for label, names in (
-        (because, map(words, others)),
-        ("note", map(words, kept)),
-        ("left out", map(words, shown.distrusted)),
-        ("stale", iter(shown.stale)),
-    ):
-        if text := ", ".join(names):
-            parts.append(f"{label}: {text}")
-    if bad:
-        parts.append(f"{bad} bad range frames")
-    return "; ".join(parts)

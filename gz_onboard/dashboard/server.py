@@ -141,7 +141,7 @@ class Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def setup(self) -> None:
-        """Limit what the kernel keeps for a slow browser."""
+        """Limit the data that the kernel keeps for a slow browser."""
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         super().setup()
 

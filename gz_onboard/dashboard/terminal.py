@@ -1,6 +1,6 @@
 """The range in a terminal, from nothing but the range frames on the bus.
 
-On a terminal a screen, redrawn at most five times a second; anywhere else a line a second.
+On a terminal a screen, redrawn at most five times a second; anywhere else a line of JSON a second.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.publisher import reason_signal
 from gz_onboard.dashboard.picture import Picture
 from gz_onboard.dashboard.pictures import pictures, until_signalled
-from gz_onboard.dashboard.screen import Line, Style, rendered, screen, summary_line
+from gz_onboard.dashboard.screen import Line, Style, rendered, screen
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import FAILED, OK, InputError
 from gz_onboard.events import Reason
@@ -68,8 +68,7 @@ def _show(view: View, channel: CanChannel, once: bool, stopped: Callable[[], boo
                 _draw(shown, style, explained, out)
             elif not on_screen and now - drawn >= 1.0:
                 drawn += math.floor(now - drawn)
-                down = "" if shown.bus_up else f"; {shown.channel} is down"
-                print(style.paint(f"{time.strftime('%H:%M:%S')} {summary_line(shown)}{down}", ""), file=out, flush=True)
+                print(shown.encoded().decode(), file=out, flush=True)
     if shown and (once or on_screen):  # the last picture stays
         for line in _lines(shown, explained, shutil.get_terminal_size().columns):
             print(rendered(line, style).rstrip(), file=out)

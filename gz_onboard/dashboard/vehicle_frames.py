@@ -1,6 +1,6 @@
 """The vehicle's own frames on the page: speed, cell temperatures, odometer and the distance ridden today.
 
-The range frames have none of these. The frames are read by the vehicle's DBC files, as the daemon reads them.
+The range frames do not have these. The frames are read by the vehicle's DBC files, as the daemon reads them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
-from gz_onboard.dashboard.view import LATE_PERIODS
+from gz_onboard.dashboard import LATE_PERIODS
 from gz_onboard.estimator.signals import STEP_LIMITS, SelfReported
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal
+from gz_onboard.dashboard import LATE_PERIODS
 from gz_onboard.events import NO_PACK, NO_SENSOR, OF_RIDING, STALE_PERIODS, Activity, Frame, Reason, State
 
 if TYPE_CHECKING:
@@ -17,14 +18,13 @@ if TYPE_CHECKING:
 
     from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 
-LATE_PERIODS = 3  # after which numbers are shown in grey; after STALE_PERIODS not at all
 TREND_STEP, TREND_STEPS = 10.0, 60  # s between the ranges of the last ten minutes, and their number
 PERIODS_MS = {"RANGE_Status": 100}  # where the DBC file does not say; 1000 for other messages
 
 
 @dataclass
 class ReceivedMessage:
-    """One message of the range frames: its definition, its latest values and what was counted."""
+    """One message of the range frames: definition, latest values and counts."""
 
     definition: Message
     period: float  # s
@@ -71,9 +71,9 @@ class ReceivedMessage:
 class View:
     """The range frames of one vehicle, as last received.
 
-    source: the vehicle's publisher, or a DBC file, the package's ``range.dbc`` if none is given; vehicle: reads what is
-    shown of the vehicle's own frames. No clock: times [s, monotonic] come with the frames. InputError if the file lacks
-    a message or signal of ``range.dbc``.
+    source: the vehicle's publisher, or a DBC file, the package's ``range.dbc`` if none is given; vehicle: reads the
+    vehicle's own frames that are shown. No clock: times [s, monotonic] come with the frames. InputError if a
+    message or signal of ``range.dbc`` is missing in the file.
     """
 
     def __init__(self, source: Publisher | Path | None = None, vehicle: VehicleFrames | None = None) -> None:
@@ -154,7 +154,7 @@ class View:
         return State(int(value)) if value is not None and value in tuple(State) else None
 
     def activity(self, now: float) -> Activity | None:
-        """What the vehicle does; None if it is unknown, or before there is an estimate."""
+        """Activity of the vehicle; None if it is unknown, or before there is an estimate."""
         value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
         return Activity(int(value)) if value and value in tuple(Activity) else None
 
