@@ -25,8 +25,8 @@ from gz_onboard.dashboard.view import View
 from gz_onboard.errors import FAILED, OK, InputError
 from gz_onboard.events import Reason
 
-REDRAW = 0.2  # s
-ONCE_WITHIN = 5.0  # s that --once waits for every message
+REDRAW_S, LINE_S = 0.2, 0.95  # at least, between two screens, and two lines
+ONCE_WITHIN_S = 5.0  # that --once waits for every message
 
 
 def show(view: View, channel: CanChannel, once: bool, duration: float | None) -> int:
@@ -38,7 +38,7 @@ def show(view: View, channel: CanChannel, once: bool, duration: float | None) ->
     if out is None:  # closed by the caller
         raise InputError("there is no standard output to show anything on")
     try:
-        with until_signalled(duration or (ONCE_WITHIN if once else None)) as stopped:
+        with until_signalled(duration or (ONCE_WITHIN_S if once else None)) as stopped:
             last = _show(view, channel, once, stopped, out)
     except OSError as error:
         if error.errno == errno.EIO:  # the terminal was closed
@@ -55,20 +55,19 @@ def _show(view: View, channel: CanChannel, once: bool, stopped: Callable[[], boo
     style = Style(terminal and "NO_COLOR" not in os.environ, "utf" in (out.encoding or "").lower())
     comments = view.comments
     explained = {str(reason.name).lower(): comments.get(reason_signal(reason), "") for reason in Reason}
-    on_screen, shown = terminal and not once, None
-    drawn = -math.inf if on_screen else time.monotonic()
+    on_screen, shown, drawn = terminal and not once, None, -math.inf
     with _other_screen(out) if on_screen else nullcontext():
         for shown in pictures(view, channel, stopped):
             now = time.monotonic()
             if once:
                 if not shown.stale:
                     break
-            elif on_screen and now - drawn >= REDRAW:
+            elif now - drawn >= (REDRAW_S if on_screen else LINE_S):
                 drawn = now
-                _draw(shown, style, explained, out)
-            elif not on_screen and now - drawn >= 1.0:
-                drawn += math.floor(now - drawn)
-                print(shown.encoded().decode(), file=out, flush=True)
+                if on_screen:
+                    _draw(shown, style, explained, out)
+                else:
+                    print(shown.encoded().decode(), file=out, flush=True)
     if shown and (once or on_screen):  # the last picture stays
         for line in _lines(shown, explained, shutil.get_terminal_size().columns):
             print(rendered(line, style).rstrip(), file=out)

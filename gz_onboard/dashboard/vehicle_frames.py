@@ -66,15 +66,16 @@ class VehicleFrames:
 
     def take(self, frame: Frame, now: float) -> None:
         """Take in a frame that came at `now`; others, and those that fail a check, are ignored."""
-        for _, number, values in self._codec.decode([frame]):
-            group = self._codec.groups[number]
+        self._codec.decode([frame])
+        for window in self._codec.windows():
+            group = self._codec.groups[window.group]
             self._witnessed += group.message == self._witness
             wrong = self._codec.faults.get((self._witness, CRC), 0)
             if self._witness and self._witnessed < max(wrong, 1):  # by chance one in 256 is right
                 continue
-            for role, value in zip(group.roles, values, strict=True):
-                if value is not None and (role != ODOMETER or self._day.take(value, frame[0], now)):
-                    self._last[role] = value, now
+            for role, samples in zip(group.roles, window.roles, strict=True):
+                if samples is not None and (role != ODOMETER or self._day.take(samples.value, frame[0], now)):
+                    self._last[role] = samples.value, now
 
     def value(self, role: str, now: float, periods: float = STALE_PERIODS) -> float | None:
         """The latest value of a role; None if it is older than `periods`, or never came."""

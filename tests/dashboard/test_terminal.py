@@ -556,8 +556,8 @@ def test_lines_where_there_is_no_terminal(tmp_path):
         child.stderr.close()
         out.seek(0)
         lines = out.read().splitlines()
-    assert len(lines) == 3
-    assert [json.loads(line)["range"]["km"] for line in lines] == [34.21] * 3
+    assert 2 <= len(lines) <= 4
+    assert json.loads(lines[-1])["range"]["km"] == 34.21
 
 
 @pytest.mark.parametrize(("redirection", "told"), [(">&-", "no standard output"), (">/dev/full", "No space left")])
