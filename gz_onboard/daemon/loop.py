@@ -227,13 +227,8 @@ def fair_share(frames: list[Frame], most: int) -> list[Frame]:
     """Keep about `most` frames, the latest of each identifier, so that one that floods the bus displaces no other."""
     if len(frames) <= most:
         return frames
-    counts = Counter(itemgetter(1, 3)(frame) for frame in frames)
-    left = most
-    for done, count in enumerate(sorted(counts.values())):
-        share = max(left // (len(counts) - done), 1)
-        if count > share:
-            break
-        left -= count
+    identifiers = {(identifier, channel) for _, identifier, _, channel in frames}
+    share = max(most // len(identifiers), 1)
     taken: Counter[tuple[int, int]] = Counter()
     kept = []
     for frame in reversed(frames):

@@ -171,7 +171,7 @@ def run(count: int, seed: int) -> Report:
         "cases": f"{count:,}",
         "damaged bytes, refused": f"{refused:,}",
         "damaged bytes, went on from the state before": f"{before:,}",
-        "odd values under a right checksum: ridden on with, a damaged part left out": f"{odd_used:,} of {count // 4:,}",
+        "odd values under a right checksum: plausible, ridden on with": f"{odd_used:,} of {count // 4:,}",
         "altered values used, exceptions": str(len(report.failures)),
     }
     return report
