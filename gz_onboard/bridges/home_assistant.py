@@ -22,7 +22,7 @@ PREFIX = "homeassistant"  # where it looks, unless it is configured otherwise
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorEntity:
     """One value. kind: Home Assistant's device class; options: the possible texts."""
 
     name: str
@@ -34,12 +34,12 @@ class Sensor:
     total: bool = False  # only grows, so that Home Assistant can sum days and months
 
 
-def _km(name: str) -> Sensor:
-    return Sensor(name, "distance", "km", digits=1)
+def _km(name: str) -> SensorEntity:
+    return SensorEntity(name, "distance", "km", digits=1)
 
 
-def _degrees(name: str) -> Sensor:
-    return Sensor(name, "temperature", "°C", digits=0)
+def _degrees(name: str) -> SensorEntity:
+    return SensorEntity(name, "temperature", "°C", digits=0)
 
 
 def _names(members: type[State] | type[Activity]) -> tuple[str, ...]:
@@ -50,24 +50,24 @@ SENSORS = {
     "range": _km("Range"),
     "range_p10": _km("Range, surely (P10)"),
     "range_p90": _km("Range, at best (P90)"),
-    "state_of_charge": Sensor("State of charge", "battery", "%", digits=0),
-    "state_of_charge_sigma": Sensor("State of charge, sigma", None, "%", digits=1, diagnostic=True),
-    "energy_left": Sensor("Energy left", "energy_storage", "Wh", digits=0),
-    "consumption_recent": Sensor("Consumption of the last kilometre", "energy_distance", "Wh/km", digits=1),
-    "consumption_expected": Sensor("Consumption expected", "energy_distance", "Wh/km", digits=1),
-    "charge_power": Sensor("Charging power", "power", "W", digits=0),
-    "time_to_full": Sensor("Time until full", "duration", "min", digits=0),
+    "state_of_charge": SensorEntity("State of charge", "battery", "%", digits=0),
+    "state_of_charge_sigma": SensorEntity("State of charge, sigma", None, "%", digits=1, diagnostic=True),
+    "energy_left": SensorEntity("Energy left", "energy_storage", "Wh", digits=0),
+    "consumption_recent": SensorEntity("Consumption of the last kilometre", "energy_distance", "Wh/km", digits=1),
+    "consumption_expected": SensorEntity("Consumption expected", "energy_distance", "Wh/km", digits=1),
+    "charge_power": SensorEntity("Charging power", "power", "W", digits=0),
+    "time_to_full": SensorEntity("Time until full", "duration", "min", digits=0),
     "range_full": _km("Range when full"),
     "route_left": _km("Distance to the destination"),
-    "arrival_state_of_charge": Sensor("State of charge on arrival", "battery", "%", digits=0),
+    "arrival_state_of_charge": SensorEntity("State of charge on arrival", "battery", "%", digits=0),
     "rated_range": _km("Rated range"),
-    "odometer": Sensor("Odometer", "distance", "km", digits=0, total=True),
+    "odometer": SensorEntity("Odometer", "distance", "km", digits=0, total=True),
     "cell_temperature_coldest": _degrees("Coldest cell"),
     "cell_temperature_hottest": _degrees("Hottest cell"),
-    "activity": Sensor("Activity", "enum", options=_names(Activity)),
-    "state": Sensor("State of the estimate", "enum", options=_names(State)),
-    "alert": Sensor("Alert", "enum", options=(NONE, *ALERTS)),
-    "reasons": Sensor("Reasons", diagnostic=True),
+    "activity": SensorEntity("Activity", "enum", options=_names(Activity)),
+    "state": SensorEntity("State of the estimate", "enum", options=_names(State)),
+    "alert": SensorEntity("Alert", "enum", options=(NONE, *ALERTS)),
+    "reasons": SensorEntity("Reasons", diagnostic=True),
 }
 """By their names in the state."""
 
@@ -133,7 +133,7 @@ def discovery(name: str) -> dict[str, object]:
     }
 
 
-def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
+def _component(name: str, key: str, sensor: SensorEntity) -> dict[str, object]:
     """Describe a sensor, which is available only while the bridge is online and the value is known."""
     there = f"value_json.status == '{ONLINE}' and value_json.{key} is not none"
     about: dict[str, object] = {

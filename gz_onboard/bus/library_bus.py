@@ -13,8 +13,7 @@ from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-ECHOING = (MULTICAST,)  # interfaces that return sent frames to the sender
-ECHO_S = 2.0  # within which they do
+MAX_ECHOES = 200
 
 
 class LibraryBus:
@@ -29,8 +28,8 @@ class LibraryBus:
         check_interface(interface)
         self.overflow = 0
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
-        self._echoing = interface in ECHOING or bool(options.get("receive_own_messages"))
-        self._sent: deque[tuple[float, int, bytes]] = deque(maxlen=1000)  # time [s], identifier, data
+        self._echoing = interface == MULTICAST or bool(options.get("receive_own_messages"))
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=MAX_ECHOES)  # frames of our own that will come back
         try:
             self._bus: Any = open_bus(interface, channel, **options)
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
@@ -59,14 +58,10 @@ class LibraryBus:
 
     def _is_echo(self, identifier: int, data: bytes) -> bool:
         """Whether that is a frame of our own, which comes back once."""
-        now = time.monotonic()
-        while self._sent and now - self._sent[0][0] > ECHO_S:
-            self._sent.popleft()
-        for sent in self._sent:
-            if sent[1:] == (identifier, data):
-                self._sent.remove(sent)
-                return True
-        return False
+        if (identifier, data) not in self._sent:
+            return False
+        self._sent.remove((identifier, data))
+        return True
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send a frame. OSError if the bus does not take it now."""
@@ -76,7 +71,7 @@ class LibraryBus:
         except can.CanError as error:
             raise _os_error(error) from error
         if self._echoing:
-            self._sent.append((time.monotonic(), identifier, data))
+            self._sent.append((identifier, data))
 
     def close(self) -> None:
         """Shut the bus down. OSError."""

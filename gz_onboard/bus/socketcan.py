@@ -27,7 +27,6 @@ NO_SOCKETS = (  # the meaning of EAFNOSUPPORT
     "--interface udp_multicast --channel 239.74.163.2"
 )
 _FRAME = struct.Struct("=IB3x8s")
-_FD_FRAME = struct.Struct("=IBB2x64s")
 _FILTER = struct.Struct("=II")
 _TIMESPEC = struct.Struct("=qq")
 _COUNT = struct.Struct("=I")
@@ -69,31 +68,21 @@ class SocketCanBus:
 
     def drain(self, frames: list[Frame], index: int, limit: int, until: float) -> bool:
         """Append the waiting frames, at most `limit`, until a monotonic time [s]; whether more may be waiting."""
-        receive, now = self._socket.recvmsg, time.monotonic
-        flags = socket.MSG_DONTWAIT
-        unpack, unpack_time = _FRAME.unpack, _TIMESPEC.unpack
-        dropped = self.overflow
         for number in range(limit):
             try:
-                data, ancillary, _, _ = receive(72, _ANCILLARY, flags)
+                data, ancillary, _, _ = self._socket.recvmsg(_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return False
             time_ns = 0
             for _level, kind, value in ancillary:
                 if kind == SO_TIMESTAMPNS:
-                    seconds, nanoseconds = unpack_time(value)
+                    seconds, nanoseconds = _TIMESPEC.unpack(value)
                     time_ns = seconds * 1_000_000_000 + nanoseconds
-                elif kind == SO_RXQ_OVFL:
-                    dropped += (_COUNT.unpack(value)[0] - dropped) & 0xFFFFFFFF  # the kernel's counter wraps
-                    self.overflow = dropped
-            if len(data) == 16:
-                identifier, length, payload = unpack(data)
-            else:
-                identifier, length, _, payload = _FD_FRAME.unpack(data)
-            if length < len(payload):
-                payload = payload[:length]
-            frames.append((time_ns or time.time_ns(), identifier, payload, index))
-            if not number & 31 and now() > until:
+                elif kind == SO_RXQ_OVFL:  # the kernel's counter wraps
+                    self.overflow += (_COUNT.unpack(value)[0] - self.overflow) & 0xFFFFFFFF
+            identifier, length, payload = _FRAME.unpack(data)
+            frames.append((time_ns or time.time_ns(), identifier, payload[:length], index))
+            if not number & 31 and time.monotonic() > until:
                 break
         return True
 

@@ -109,9 +109,10 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
 
 
 def _load(file: Path) -> tuple[Mapping[str, Any], float | None]:
+    """Snapshot and age [s] of a state. ValueError if there is none, or if it is damaged."""
     found = state.load(file, time.time())
     if found is None:
-        raise InputError(f"{file}: no saved state; the daemon keeps one in its state folder")
+        raise ValueError("no saved state; the daemon keeps one in its state folder")
     return found
 
 
@@ -121,7 +122,7 @@ def _usable(file: Path) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        hint = "give the state of this vehicle with --state FILE or --vehicle NAME|TOML"
+        hint = "choose another with --state FILE or --vehicle NAME|TOML"
         raise InputError(f"{file}: {error}; {hint}") from error
 
 
