@@ -146,6 +146,16 @@ def test_the_daemon_loads_nothing_heavy(name):
     assert not HEAVY & loaded
 
 
+def test_the_daemon_starts_light():
+    """Without numpy, and on SocketCAN without python-can, which is a quarter of its start."""
+    code = (
+        "import sys; from gz_onboard.daemon import command; from gz_onboard.vehicle import read_vehicle;"
+        "from gz_onboard.pipeline import Pipeline; Pipeline(read_vehicle('reference')); print(*sys.modules)"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"numpy", "scipy", "can", "asyncio", "ssl"} & set(loaded)
+
+
 def test_the_api_is_loaded_only_when_asked_for():
     code = (
         "import sys, gz_onboard.daemon.command as command, gz_onboard as gz; own = 'gz_onboard.api';"
