@@ -34,12 +34,17 @@ class StateKeeper:
         self._thread = Background("state")
         self._saved_ns: int | None = None
         self._saved_soc: float | None = None
-        self._failing = self._stuck = False
+        self._failing = False
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the disk does not answer."""
+        return self._thread.stuck > STATE_STUCK_S
 
     @property
     def failing(self) -> bool:
         """Whether the state cannot be saved: an error, or a disk that does not answer."""
-        return self._failing or self._thread.stuck > STATE_STUCK_S
+        return self._failing or self.stuck
 
     def restore(self, pipeline: Pipeline, make: Callable[[], Pipeline]) -> tuple[Pipeline, Mapping[str, Any] | None]:
         """Restore the newest copy that can be used into `pipeline`; return the pipeline to use, and the snapshot.
@@ -89,13 +94,6 @@ class StateKeeper:
         self._saved_ns, self._saved_soc = now_ns, pipeline.last.soc if pipeline.last else None
         uptime = _uptime()
         self._thread.call(self._write, snapshot, now_ns * 1e-9, uptime, weight=0 if self._thread.load else 1)
-
-    def report(self) -> None:
-        """Log once that the disk does not answer."""
-        stuck = self._thread.stuck > STATE_STUCK_S
-        if stuck and not self._stuck:
-            log.warning("cannot save the state: the disk does not answer")
-        self._stuck = stuck
 
     def close(self, seconds: float) -> bool:
         """Wait until all is saved; False if it cannot be, or if that takes longer than `seconds`."""

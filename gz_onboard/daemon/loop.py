@@ -195,8 +195,8 @@ class Daemon:
         error = self._log.last_error if self._log and self._log.failing else ""
         if self._is_news("log", error):
             log.warning("cannot write the log: %s", error)
-        if self._keeper:
-            self._keeper.report()
+        if self._is_news("state", "stuck" if self._keeper and self._keeper.stuck else ""):
+            log.warning("cannot save the state: the disk does not answer")
         if self._is_news("foreign", "foreign" if self.pipeline.foreign else ""):
             log.warning("%s", foreign_text(self.pipeline))
         last = self.pipeline.last
@@ -205,7 +205,7 @@ class Daemon:
         counts = self.pipeline.counts()
         state, remaining, _, _ = self.pipeline.publisher.reported(last)
         text = state_text(state, last.reasons)
-        if self._is_news("state", text):
+        if self._is_news("estimate", text):
             log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
         if remaining is not None and last.soc is not None:
             text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
