@@ -1,8 +1,8 @@
 """A CAN channel, drained once for each tick of its reader instead of waking up for each frame.
 
 A SocketCAN bus is read by its socket (`gz_onboard.bus.socketcan`), all others by python-can
-(`gz_onboard.bus.library_bus`), which is imported for them only: it costs 9 MB and a fifth of the daemon's start. A bus that
-goes down is closed, and reopened once it is back; nothing here raises for it.
+(`gz_onboard.bus.library_bus`), which is imported for them only: it costs 9 MB and a fifth of the daemon's start. A bus
+that goes down is closed, and reopened once it is back; nothing here raises for it.
 """
 
 from __future__ import annotations
