@@ -5,9 +5,8 @@ Backward in the sense of simulation (speed in, power out), light enough for on b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping
-from functools import partial
-from operator import itemgetter
+from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
@@ -55,9 +54,11 @@ class Bound:
     def __init__(self, effect: Effect, parameters: Mapping[str, float]) -> None:
         self.effect = effect
         self._values = {name: parameters[name] for name in (*effect.keywords, *effect.decay_keywords)}
-        self.term = _with(effect.term, effect.quantities, {name: parameters[name] for name in effect.keywords})
-        values = {name: parameters[name] for name in effect.decay_keywords}
-        self._decay = _valued(effect.decay, values) if effect.decay else None
+        self.bare_term = _valued(effect.term, {name: parameters[name] for name in effect.keywords})
+        self.bare_decay = effect.decay and _valued(
+            effect.decay, {name: parameters[name] for name in effect.decay_keywords}
+        )
+        self.term = _reader(effect.quantities)(self.bare_term)
 
     def __reduce__(self) -> tuple[type[Bound], tuple[Effect, dict[str, float]]]:
         """Pickled as effect and values: another process does not know the functions of a user's own file."""
@@ -69,9 +70,9 @@ class Bound:
 
     def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
         """The factor that its state keeps over `dt` [s]; of an effect without memory 0."""
-        if self._decay is None:
+        if self.bare_decay is None:
             return 0.0
-        return self._decay(dt, *[quantities[name] for name in self.effect.decay_quantities])
+        return self.bare_decay(dt, *[quantities[name] for name in self.effect.decay_quantities])
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
         """Its value after `dt` [s] from `state`."""
@@ -106,23 +107,9 @@ def _valued(function: Callable[..., Any], values: Mapping[str, float]) -> Callab
     return partial(function, **values)
 
 
-def _with(
-    function: Callable[..., Any], names: tuple[str, ...], values: Mapping[str, float]
-) -> Callable[[Mapping[str, Any]], Any]:
-    """`function` of the quantities called `names`; items one by one take two thirds of the time of a tuple of them."""
-    term = _valued(function, values)
-    match names:
-        case ():
-            return lambda q: term()
-        case (a,):
-            return lambda q: term(q[a])
-        case (a, b):
-            return lambda q: term(q[a], q[b])
-        case (a, b, c):
-            return lambda q: term(q[a], q[b], q[c])
-        case _:
-            read = itemgetter(*names)
-            return lambda q: term(*read(q))
+def _call(function: str, names: Iterable[str]) -> str:
+    """Source of a call of `function` with the quantities `names` out of a dictionary ``q``."""
+    return f"{function}({', '.join(f'q[{name!r}]' for name in names)})"
 
 
 Recall = Callable[[Bound, Mapping[str, Any]], Any]
@@ -145,18 +132,38 @@ def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
     return recall
 
 
-def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float]:
-    """The value of `effect` as a function that is called once each step of `dt` [s]; from nothing remembered."""
-    if effect.effect.decay is None:
-        return effect.term
-    state = 0.0
+@cache
+def _reader(names: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[[Mapping[str, Any]], Any]]:
+    """Turns a function of the quantities `names` into one of a dictionary of quantities."""
+    return eval(f"lambda function: lambda q: {_call('function', names)}")  # type: ignore[no-any-return]
 
-    def value(quantities: Mapping[str, Any]) -> float:
-        nonlocal state
-        state = effect.step(state, dt, quantities)
-        return state
 
-    return value
+def stepper(effects: Sequence[Bound], dt: float) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """A function from quantities (floats) to the values of `effects`, to be called once each step of `dt` [s].
+
+    Effects with memory start from 0. The function is written out as source, without loops and layers of calls:
+    a simulation calls it a hundred times for each second ridden.
+    """
+    scope: dict[str, Any] = {}
+    lines = []
+    for i, bound in enumerate(effects):
+        effect = bound.effect
+        scope[f"term{i}"] = bound.bare_term
+        call = _call(f"term{i}", effect.quantities)
+        if bound.bare_decay:
+            scope[f"state{i}"], scope[f"decay{i}"] = 0.0, partial(bound.bare_decay, dt)
+            decay = _call(f"decay{i}", effect.decay_quantities)
+            if not effect.decay_quantities:
+                scope[f"kept{i}"], decay = bound.bare_decay(dt), f"kept{i}"
+            lines += [f"k = {decay}", f"state{i} = k * state{i} + (1 - k) * {call}"]
+            call = f"state{i}"
+        lines.append(f"value{i} = {call}")
+    states = ", ".join(name for name in scope if name.startswith("state"))
+    values = "".join(f"value{i}, " for i in range(len(effects)))
+    body = [f"global {states}"] if states else []
+    source = "\n    ".join(["def values(q):", *body, *lines, f"return ({values})"])
+    exec(source, scope)
+    return scope["values"]  # type: ignore[no-any-return]
 
 
 BURST = 10.0  # s: a load in traffic

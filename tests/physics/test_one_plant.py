@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.arrays import block_means
-from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
@@ -25,9 +24,9 @@ from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.model import air_density, stepper
 from gz_onboard.physics.tables import Mesh, bilinear_over, extended, extended_over, linear
-from gz_onboard.simulation.parts.battery import EffectPack
+from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
@@ -172,7 +171,8 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
 def test_the_simulation_draws_the_same_current_and_heat(ride):
     volts, heat = written_out(ride)
     quantities = dict.fromkeys(QUANTITIES, 0.0)
-    pack, drawn = EffectPack(PACK, SOC, CellEffects(VEHICLE.model, PACK), quantities), []
+    effects = stepper(VEHICLE.model.at(Port.CELL_VOLTAGE), 0.1)
+    pack, drawn = FirstOrderPack(PACK, SOC, effects=effects, quantities=quantities), []
     for k, celsius in enumerate(ride["cell_temperature"]):
         watts = PACK.pack_voltage(volts[k], ride["pack_current"][k]) * ride["pack_current"][k]
         steps = [pack.draw(watts, 0.1, celsius) for _ in range(10)]

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Protocol
 
-from gz_onboard.physics.model import Bound
+from gz_onboard.physics.model import Bound, stepper
 
 Quantities = MutableMapping[str, float]
 Ledger = MutableMapping[str, float]
 """Energy [J] by name; what is not in it yet is 0."""
 
 
-Call = tuple[str, Callable[[Mapping[str, float]], float]]
-"""An effect's name and its value as a function of the quantities, called once each step."""
-
-
 class Losses:
-    """The effects at one port, summed and booked a step of `dt` [s] at a time."""
+    """The effects at one port, added up and booked a step of `dt` [s] at a time."""
 
-    def __init__(self, calls: Sequence[Call], dt: float) -> None:
-        self._calls, self._dt = calls, dt
+    def __init__(self, effects: Sequence[Bound], dt: float) -> None:
+        self.names = [bound.effect.name for bound in effects]
+        self._values, self._dt = stepper(effects, dt), dt
 
     def total(self, quantities: Mapping[str, float], ledger: Ledger) -> float:
         """Their sum [W]; adds each [J] to `ledger` by its name."""
-        total = 0.0
-        for name, call in self._calls:
-            watts = call(quantities)
-            ledger[name] += watts * self._dt
+        total, dt = 0.0, self._dt
+        for name, watts in zip(self.names, self._values(quantities), strict=True):
+            ledger[name] += watts * dt
             total += watts
         return total
 
@@ -48,21 +44,20 @@ class Motor(Protocol):
 class EffectMotor:
     """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists.
 
-    booked: their sum a step at a time; settled: what they settle at.
     quantities: what the effects read.
     """
 
     def __init__(
         self,
-        booked: Losses,
-        settled: Sequence[Bound],
+        effects: Sequence[Bound],
+        dt: float,
         torque_constant: float,
         voltage_constant: float,
         quantities: Quantities,
     ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
-        self._booked, self._settled = booked, [effect.term for effect in settled]
+        self._losses, self._settled = Losses(effects, dt), [effect.term for effect in effects]
         self._q = quantities
 
     def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
@@ -70,7 +65,7 @@ class EffectMotor:
         q = self._q
         q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
         q["torque"] = self.torque_constant * current
-        return self._booked.total(q, ledger)
+        return self._losses.total(q, ledger)
 
     def idle(self, speed: float, temperature: float) -> float:
         """See `Motor`; not a step for an effect with memory."""

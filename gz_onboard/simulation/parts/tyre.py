@@ -43,3 +43,9 @@ class Tyre:
             return 0.0, 1 / scale
         decay = 1 / (1 + dt * abs(speed) / self.relaxation_length)
         return self.slip * decay, dt / self.relaxation_length * decay
+
+    def grip(self, rim: float, speed: float, dt: float) -> tuple[float, float, float, float]:
+        """(base, gain) of `linear`, and (µ, dµ/dκ) of `friction` at the slip of unchanged speeds [m/s]."""
+        base, gain = self.linear(rim, speed, dt)
+        mu, slope = self.friction(base + gain * (rim - speed))
+        return base, gain, mu, slope
