@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.constants import KELVIN, WH
 from gz_onboard.physics.derating import DeratingCurve
-from gz_onboard.physics.model import BASE_EFFECTS
-from gz_onboard.physics.tables import linear
+from gz_onboard.physics.effect import BASE_EFFECTS
+from gz_onboard.physics.functions import linear
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter

@@ -30,9 +30,9 @@ from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effects import charge_transfer, slow_relaxation
+from gz_onboard.physics.functions import Mesh
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
 TEMPERATURES = (25, 10, 0, -10, -20)

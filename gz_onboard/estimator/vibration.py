@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from gz_onboard.physics.vibration import FAST, SLOW, Vibration
+from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, Vibration
 
-SETTLED = 3 * SLOW  # s of samples before there is a value: 97 % of it is there
+SETTLED = 3 * VIBRATION_MEMORY_S  # s of samples before there is a value: 97 % of it is there
 LONGEST_INTERVAL = 0.034  # s between samples in the mean: those further apart do not show what a road does to a wheel
 STUCK = 1.0  # s of one and the same value: no accelerometer, not even at rest, gives that
 
@@ -29,7 +29,7 @@ class VibrationMonitor:
         dt = time - self._time
         if dt == 0:
             return
-        if not 0 < dt <= FAST or time - self._same > STUCK:
+        if not 0 < dt <= VIBRATION_PERIOD_S or time - self._same > STUCK:
             same = self._same if accel_z == self._before else time
             self._restart(time, accel_z)
             self._same = same if dt > 0 else time
@@ -43,6 +43,6 @@ class VibrationMonitor:
     def value(self, now: float) -> float | None:
         """[m/s²] at `now` [s]; None while samples are missing, too few, or only just come again."""
         elapsed = self._time - self._since
-        if now - self._time > FAST or elapsed < SETTLED or self._count * LONGEST_INTERVAL < elapsed:
+        if now - self._time > VIBRATION_PERIOD_S or elapsed < SETTLED or self._count * LONGEST_INTERVAL < elapsed:
             return None
         return self._vibration.value

@@ -22,8 +22,8 @@ from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
+from gz_onboard.physics.functions import relaxed
 from gz_onboard.physics.model import air_density, all_quantities, drag_torque, over, stepper, total
-from gz_onboard.physics.relaxation import relaxed
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle

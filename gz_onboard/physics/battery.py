@@ -8,7 +8,7 @@ cell rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its hea
 `entropy` over SOC, what the reaction gives or takes as heat without loss.
 
 The functions are the equations, of floats and of numpy arrays alike; who simulates, estimates, calibrates, validates
-or discovers calls them. The RC pair is `physics.relaxation`.
+or discovers calls them. The RC pair is `physics.functions`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
-from gz_onboard.physics.relaxation import decay_over, relaxed
-from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
+from gz_onboard.physics.functions import Mesh, Row, decay_over, extended, extended_over, linear, relaxed
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.physics.battery import HALF_FULL, Battery, Window
-from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.similarity import MOST_CELLS
-from gz_onboard.physics.tables import Mesh, Row, linear
+from gz_onboard.physics.functions import Mesh, Row, linear
+from gz_onboard.physics.parameters import MOST_CELLS, Parameters
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table

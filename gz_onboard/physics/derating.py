@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from gz_onboard.physics.tables import Row, linear
+from gz_onboard.physics.functions import Row, linear
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table

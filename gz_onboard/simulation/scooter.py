@@ -17,7 +17,7 @@ from typing import TypedDict, Unpack
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.functions import direction
 from gz_onboard.physics.model import air_density, drag_torque, stepper
 from gz_onboard.simulation.parts.battery import FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
@@ -155,7 +155,7 @@ class Scooter:
         disc = p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"]
         brakes = Brakes(*disc, p["front_brake_share"], options.get("brake_form", "friction"))
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
-        forces = [e for e in model.at(Port.WHEEL_FORCE) if "acceleration" not in e.effect.quantities]
+        forces = [e for e in model.at(Port.WHEEL_FORCE) if "acceleration" not in e.effect.reads]
         if roller:
             forces = [e for e in forces if e.effect.reads <= WHEEL_ONLY]
         rolling = model.at(Port.TYRE)

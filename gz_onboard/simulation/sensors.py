@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.vibration import FAST
+from gz_onboard.physics.sensors import VIBRATION_PERIOD_S
 from gz_onboard.simulation.trace import Truth
 
 BAR = 1e5  # Pa
@@ -188,11 +188,13 @@ ROLLER: tuple[Sensor, ...] = (
 def shaken(sensor: Sensor, truth: Truth, period: float) -> Array | None:
     """The standard deviation of what the road shakes into the sensor [its unit] at each step; None if it does not.
 
-    White, sampled each `period` [s], of the size that `physics.vibration.Vibration` makes the truth's vibration of.
+    White, sampled each `period` [s], of the size that `physics.sensors.Vibration` makes the truth's vibration of.
     """
     if sensor.signal != "IMU_AccelZ" or not truth["vibration"].any():
         return None
-    keep = np.exp(-period / FAST)  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
+    keep = np.exp(
+        -period / VIBRATION_PERIOD_S
+    )  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
     shown: Array = truth["vibration"] / (keep * np.sqrt(2 / (1 + keep)))
     return shown
 

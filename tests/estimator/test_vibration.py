@@ -16,7 +16,7 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.vibration import SETTLED, STUCK, VibrationMonitor
 from gz_onboard.events import Group
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.vibration import Vibration
+from gz_onboard.physics.sensors import Vibration
 from gz_onboard.simulation.frames import batches, simulate_frames
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter

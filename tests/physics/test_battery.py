@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
 from gz_onboard.physics.effect import Port, load_effect
+from gz_onboard.physics.functions import Mesh
 from gz_onboard.physics.model import Model, first_soc
-from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

@@ -121,13 +121,14 @@ def test_2_11_and_2_12_gearing(throttle, brake):
 
 def test_2_13_and_2_14_printed_brake():
     brakes = Brakes(280.0, 60.0, 0.09, 0.0, form="viscous")
-    assert brakes.torque(0.5, 20.0, 1e9) == pytest.approx(20.0 * 0.5 * 60.0 * 0.09)
+    assert brakes.bounds(0.5, 5.0, 20.0, 0.25)[2:] == pytest.approx([20.0 * 0.5 * 60.0 * 0.09] * 2)
 
 
 def test_2_13_default_brake_is_friction():
     brakes = Brakes(280.0, 60.0, 0.09, 0.25)
-    assert brakes.torque(0.5, 20.0, 1e9) == brakes.torque(0.5, 5.0, 1e9) == pytest.approx(0.5 * 0.75 * 280)
-    assert brakes.torque(0.5, 0.1, 3.0) == 3.0  # no more than brings it to rest
+    assert brakes.bounds(0.5, 5.0, 20.0, 0.25) == brakes.bounds(0.5, 0.1, 0.0, 0.25)
+    rear, front = 0.5 * 0.75 * 280, 0.5 * 0.25 * 280 / 0.25
+    assert brakes.bounds(0.5, 5.0, 20.0, 0.25) == pytest.approx((-front, front, -rear, rear))
 
 
 def test_2_16_and_2_17_bms(riding):

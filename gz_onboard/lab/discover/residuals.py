@@ -21,8 +21,8 @@ from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
+from gz_onboard.physics.functions import decay_over, relaxation, relaxed
 from gz_onboard.physics.model import drag_torque, first_soc, standing_load
-from gz_onboard.physics.relaxation import decay_over, relaxation, relaxed
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
@@ -90,8 +90,8 @@ def torque_constant(ride: Ride, p: Values, system: System) -> Array:
 def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> tuple[Any, Any]:
     """(losses fed electrically, losses that drag) [W]. Loss that does not depend on current drags the shaft."""
     terms = system.terms(q, p, STEP, Port.MOTOR_LOSS)
-    fed = [(effect, term) for effect, term in terms if "motor_current" in effect.quantities]
-    drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.quantities]
+    fed = [(effect, term) for effect, term in terms if "motor_current" in effect.term.quantities]
+    drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.term.quantities]
     return summed(fed), summed(drags)
 
 

@@ -52,7 +52,7 @@ class System:
             value = value_of(Bound(effect, p), known, recall)
             if effect.variation:
                 healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
-                value = value * effect.variation.of(known, {**p, **healthy})
+                value = value * effect.variation.at(known, {**p, **healthy})
             found.append((effect, value))
         return found
 

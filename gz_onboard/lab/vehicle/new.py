@@ -29,8 +29,7 @@ from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.kinds import KINDS, LARGE
 from gz_onboard.lab.vehicle.power import Motor
 from gz_onboard.options import number
-from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.physics.similarity import MOST_CELLS
+from gz_onboard.physics.parameters import MOST_CELLS, declared_parameters
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 

@@ -7,8 +7,19 @@ from typing import Any
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "scooter with upright rider: Cossalter 2006, table 3.1, CdA 0.5-0.7"
-PARAMETERS = (Parameter("drag_area", "m²", 0.55, 0.15, 0.05, 8.0, SOURCE, ride_sd=0.01, required=True),)
+PARAMETERS = (
+    Parameter(
+        "drag_area",
+        "m²",
+        prior=0.55,
+        prior_sd=0.15,
+        low=0.05,
+        high=8.0,
+        source="scooter with upright rider: Cossalter 2006, table 3.1, CdA 0.5-0.7",
+        ride_sd=0.01,
+        required=True,
+    ),
+)
 CAUSE = ("aero_drag_area", "F = ½·ρ·CdA·V²")
 SHOWN_BY = (
     "Road load that grows with the square of speed; long stretches at 30 and at 50 km/h in both directions split it"

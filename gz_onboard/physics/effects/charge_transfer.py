@@ -12,18 +12,55 @@ from typing import Any
 
 from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN, THERMAL_VOLTAGE
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import asinh, exp
+from gz_onboard.physics.functions import asinh, exp
 
 PORT = Port.CELL_VOLTAGE
-RESISTANCE = "18650 cells: a third of R0 at 25 degC"
-ACTIVATION = "50 kJ/mol; Li-ion cells: 35 to 110"
-REACTIONS = "2 where both electrodes are alike slow, 1 where one is"
-DOUBLE_LAYER = "double layer: tenths of a second to seconds"
 PARAMETERS = (  # of the kind of cell: from ride to ride they stay, but for how well its temperature is known
-    Parameter("charge_transfer_resistance", "ohm", 0.01, 0.01, 0.0, 10.0, RESISTANCE, ride_sd=1e-4, bench=True),
-    Parameter("charge_transfer_activation", "K", 6000.0, 2500.0, 0.0, 15000.0, ACTIVATION, ride_sd=20.0, bench=True),
-    Parameter("charge_transfer_time", "s", 1.0, 1.0, 0.01, 60.0, DOUBLE_LAYER, ride_sd=0.02, bench=True),
-    Parameter("charge_transfer_reactions", "1", 1.0, 0.5, 0.5, 4.0, REACTIONS, ride_sd=0.02, bench=True),
+    Parameter(
+        "charge_transfer_resistance",
+        "ohm",
+        prior=0.01,
+        prior_sd=0.01,
+        low=0.0,
+        high=10.0,
+        source="18650 cells: a third of R0 at 25 degC",
+        ride_sd=1e-4,
+        bench=True,
+        grows_with="cell_capacity^-1",
+    ),
+    Parameter(
+        "charge_transfer_activation",
+        "K",
+        prior=6000.0,
+        prior_sd=2500.0,
+        low=0.0,
+        high=15000.0,
+        source="50 kJ/mol; Li-ion cells: 35 to 110",
+        ride_sd=20.0,
+        bench=True,
+    ),
+    Parameter(
+        "charge_transfer_time",
+        "s",
+        prior=1.0,
+        prior_sd=1.0,
+        low=0.01,
+        high=60.0,
+        source="double layer: tenths of a second to seconds",
+        ride_sd=0.02,
+        bench=True,
+    ),
+    Parameter(
+        "charge_transfer_reactions",
+        "1",
+        prior=1.0,
+        prior_sd=0.5,
+        low=0.5,
+        high=4.0,
+        source="2 where both electrodes are alike slow, 1 where one is",
+        ride_sd=0.02,
+        bench=True,
+    ),
 )
 STRENGTHS = ()  # pulses of several currents show it; a ride shows it as resistance only
 

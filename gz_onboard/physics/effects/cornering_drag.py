@@ -13,11 +13,22 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.functions import direction
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3"
-PARAMETERS = (Parameter("cornering_compliance", "rad", 0.1, 0.05, 0.0, 0.5, SOURCE, ride_sd=0.015, healthy_sd=0.1),)
+PARAMETERS = (
+    Parameter(
+        "cornering_compliance",
+        "rad",
+        prior=0.1,
+        prior_sd=0.05,
+        low=0.0,
+        high=0.5,
+        source="Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3",
+        ride_sd=0.015,
+        healthy_sd=0.1,
+    ),
+)
 TURNING_LOSS = True
 SHOWN_BY = (
     "Road load that grows with the square of speed times yaw rate and is absent on the straight; bends at one speed, "

@@ -8,12 +8,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import ROTATION, Parameter, Port
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "seals and bearings: 1 N·m at 50 rad/s"
 PARAMETERS = (
-    Parameter("drivetrain_drag_torque", "N·m·s/rad", 0.02, 0.02, 0.0, 50.0, SOURCE, ride_sd=0.005, healthy_sd=0.01),
+    Parameter(
+        "drivetrain_drag_torque",
+        "N·m·s/rad",
+        prior=0.02,
+        prior_sd=0.02,
+        low=0.0,
+        high=50.0,
+        source="seals and bearings: 1 N·m at 50 rad/s",
+        ride_sd=0.005,
+        healthy_sd=0.01,
+        grows_with=ROTATION,
+    ),
 )
 SHOWN_BY = (
     "Road load in proportion to speed, the same at all payloads; rides over all speeds split it from drag area, which "

@@ -11,13 +11,32 @@ from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.effects.aerodynamic_drag import term as drag
-from gz_onboard.physics.elementary import cos, sin
+from gz_onboard.physics.functions import cos, sin
 
 PORT = Port.WHEEL_FORCE
-WEATHER = "at 1 m over ground half of the 3-5 m/s that weather tells"
 PARAMETERS = (
-    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
-    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
+    Parameter(
+        "wind_north",
+        "m/s",
+        prior=0.0,
+        prior_sd=2.0,
+        low=-15.0,
+        high=15.0,
+        source="at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
+    Parameter(
+        "wind_east",
+        "m/s",
+        prior=0.0,
+        prior_sd=2.0,
+        low=-15.0,
+        high=15.0,
+        source="at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
 )
 STRENGTHS = ("wind_north", "wind_east")
 VARIES = True

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import TORQUE, Parameter, Port
 
 PORT = Port.MOTOR_LOSS
-HYSTERESIS = "Bertotti 1988: hysteresis loss grows with frequency"
-EDDIES = "Bertotti 1988: eddy loss, its square"
 PARAMETERS = (
-    Parameter("motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 200.0, HYSTERESIS, ride_sd=0.03, bench=True),
-    Parameter("motor_iron_quadratic", "W·s²/rad²", 0.01, 0.01, 0.0, 20.0, EDDIES, ride_sd=0.001, bench=True),
+    Parameter(
+        "motor_iron_linear",
+        "W·s/rad",
+        prior=0.5,
+        prior_sd=0.4,
+        low=0.0,
+        high=200.0,
+        source="Bertotti 1988: hysteresis loss grows with frequency",
+        ride_sd=0.03,
+        bench=True,
+        grows_with=TORQUE,
+    ),
+    Parameter(
+        "motor_iron_quadratic",
+        "W·s²/rad²",
+        prior=0.01,
+        prior_sd=0.01,
+        low=0.0,
+        high=20.0,
+        source="Bertotti 1988: eddy loss, its square",
+        ride_sd=0.001,
+        bench=True,
+        grows_with="mass wheel_radius^2 gear_ratio^2",
+    ),
 )
 
 

@@ -10,14 +10,22 @@ from typing import Any
 
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import exp
+from gz_onboard.physics.functions import exp
 
 PORT = Port.CELL_VOLTAGE
-HYSTERESIS = "NMC: Barai et al. 2015, 5 to 20 mV"
-SETTLING = "Plett 2004, part 2: settles within 5 % of SOC"
 PARAMETERS = (
-    Parameter("hysteresis_voltage", "V", 0.01, 0.008, 0.0, 0.1, HYSTERESIS, ride_sd=0.001, healthy_sd=0.005),
-    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, SETTLING),
+    Parameter(
+        "hysteresis_voltage",
+        "V",
+        prior=0.01,
+        prior_sd=0.008,
+        low=0.0,
+        high=0.1,
+        source="NMC: Barai et al. 2015, 5 to 20 mV",
+        ride_sd=0.001,
+        healthy_sd=0.005,
+    ),
+    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, "Plett 2004, part 2: settles within 5 % of SOC"),
 )
 SHOWN_BY = (
     "Voltage that stays low at rest after riding and high after charging or long braking, without coming back; rests "

@@ -11,8 +11,19 @@ from typing import Any
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.INVERTER_LOSS
-SOURCE = "a guess: a tenth of what the motor takes"
-PARAMETERS = (Parameter("regeneration_loss_share", "1", 0.1, 0.1, 0.0, 1.0, SOURCE, ride_sd=0.02, healthy_sd=0.03),)
+PARAMETERS = (
+    Parameter(
+        "regeneration_loss_share",
+        "1",
+        prior=0.1,
+        prior_sd=0.1,
+        low=0.0,
+        high=1.0,
+        source="a guess: a tenth of what the motor takes",
+        ride_sd=0.02,
+        healthy_sd=0.03,
+    ),
+)
 SHOWN_BY = (
     "DC power short of the model's while the motor brakes and right while it drives; stops from speed by the motor "
     "alone split it from the friction brakes."

@@ -9,14 +9,30 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.functions import direction
 
 PORT = Port.TYRE
-TYRES = "scooter tyres: Cossalter 2006, sec. 2.3"
-RISE = "SAE J2452: rises by a few percent per m/s"
 PARAMETERS = (
-    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, TYRES, ride_sd=7e-4),
-    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, RISE, ride_sd=2e-5),
+    Parameter(
+        "rolling_resistance_constant",
+        "1",
+        prior=0.015,
+        prior_sd=0.005,
+        low=0.0,
+        high=0.06,
+        source="scooter tyres: Cossalter 2006, sec. 2.3",
+        ride_sd=7e-4,
+    ),
+    Parameter(
+        "rolling_resistance_speed",
+        "s/m",
+        prior=2e-4,
+        prior_sd=2e-4,
+        low=0.0,
+        high=3e-3,
+        source="SAE J2452: rises by a few percent per m/s",
+        ride_sd=2e-5,
+    ),
 )
 CAUSE = ("rolling_resistance", "F = m·g·cos θ·c0")
 SHOWN_BY = (

@@ -9,14 +9,23 @@ from __future__ import annotations
 from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import exp
+from gz_onboard.physics.functions import exp
 
 PORT = Port.CELL_VOLTAGE
-RESISTANCE = "18650 NMC at 25 degC: a fifth to half of R0"
-DIFFUSION = "diffusion in 5-10 µm particles: 10 to 40 min"
 PARAMETERS = (
-    Parameter("slow_resistance", "ohm", 0.008, 0.006, 0.0, 10.0, RESISTANCE, ride_sd=0.001, healthy_sd=0.01),
-    Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, DIFFUSION),
+    Parameter(
+        "slow_resistance",
+        "ohm",
+        prior=0.008,
+        prior_sd=0.006,
+        low=0.0,
+        high=10.0,
+        source="18650 NMC at 25 degC: a fifth to half of R0",
+        ride_sd=0.001,
+        healthy_sd=0.01,
+        grows_with="cell_capacity^-1",
+    ),
+    Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, "diffusion in 5-10 µm particles: 10 to 40 min"),
 )
 SHOWN_BY = (
     "Pack voltage that sinks over tens of minutes of riding and comes back over tens of minutes of rest; a rest of "

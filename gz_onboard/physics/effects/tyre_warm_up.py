@@ -9,14 +9,30 @@ from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.effects.rolling_resistance import term as rolling
-from gz_onboard.physics.elementary import exp
+from gz_onboard.physics.functions import exp
 
 PORT = Port.TYRE
-SHARE = "a guess: as cold days over warm ones, 20 to 40 %"
-RUNNING = "ISO 28580: warm after 30 min of running: three times this"
 PARAMETERS = (
-    Parameter("warm_up_share", "1", 0.3, 0.2, 0.0, 2.0, SHARE, ride_sd=0.05, healthy_sd=0.2),
-    Parameter("warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, RUNNING),
+    Parameter(
+        "warm_up_share",
+        "1",
+        prior=0.3,
+        prior_sd=0.2,
+        low=0.0,
+        high=2.0,
+        source="a guess: as cold days over warm ones, 20 to 40 %",
+        ride_sd=0.05,
+        healthy_sd=0.2,
+    ),
+    Parameter(
+        "warm_up_time",
+        "s",
+        prior=600.0,
+        prior_sd=200.0,
+        low=60.0,
+        high=3600.0,
+        source="ISO 28580: warm after 30 min of running: three times this",
+    ),
 )
 SHOWN_BY = (
     "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "

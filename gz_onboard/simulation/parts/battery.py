@@ -8,8 +8,7 @@ from typing import Protocol
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
-from gz_onboard.physics.relaxation import decay_over, relaxed
-from gz_onboard.physics.tables import extended
+from gz_onboard.physics.functions import decay_over, extended, relaxed
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 

@@ -141,7 +141,7 @@ def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantit
     at, values, _ = np.array(knots).T
     expected = hat_functions(x, at, quantity == "heading") @ values
     fast = {"speed": x if quantity == "speed" else np.full(len(x), 30.0)}
-    reads = {q: fast["speed"] if q == "speed" else x for q in effect.quantities}
+    reads = {q: fast["speed"] if q == "speed" else x for q in effect.term.quantities}
     fade = fast["speed"] ** 2 / (fast["speed"] ** 2 + 1)
     assert Bound(effect, scale)(reads) == pytest.approx(expected * fade, abs=1e-4)
     one = {q: float(v[7]) for q, v in reads.items()}  # on board: floats
