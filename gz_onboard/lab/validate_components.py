@@ -178,16 +178,17 @@ def _temperatures(
 
     if "motor_temperature" in measured:
         heats = measured["motor_heat"], measured["idle_heat"]
-        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), *heats)
+        warm = start("motor_temperature")
+        add("motor_temperature", MotorCooling(p, warm, warm), *heats)
     if "inverter_temperature" in measured:
-        network = InverterCooling.of(p, start("inverter_temperature"))
-        add("inverter_temperature", network, measured["inverter_heat"])
+        warm = start("inverter_temperature")
+        add("inverter_temperature", InverterCooling(p, warm, warm), measured["inverter_heat"])
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
         rest = battery.ocv_over(levels, cells) * battery.cells_series
         delivered = measured.get("pack_power", measured["pack_voltage"] * current)
         generated = heat(rest, 0.0, current) - delivered + battery.reversible_heat(current, levels, cells)
-        pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
+        pack = LumpedCooling(p, "pack", start("cell_temperature"))
         add("cell_temperature", pack, generated)
     return found

@@ -130,10 +130,10 @@ class Scooter:
         self.motor: Motor = options.get("motor") or EffectMotor(model.at(Port.MOTOR_LOSS), dt, *constants, self._q)
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
-        self.inverter_cooling = InverterCooling.of(p, self.ambient)
-        self.motor_cooling = MotorCooling.of(p, self.ambient)
-        self.pack_cooling = LumpedCooling.of(p, "pack", celsius)
-        self.bms_cooling = LumpedCooling.of(p, "bms", celsius)
+        self.inverter_cooling = InverterCooling(p, self.ambient, self.ambient)
+        self.motor_cooling = MotorCooling(p, self.ambient, self.ambient)
+        self.pack_cooling = LumpedCooling(p, "pack", celsius)
+        self.bms_cooling = LumpedCooling(p, "bms", celsius)
         self._cooling_factor = p["cooling_factor"]
         self._bms_resistance = min(p["bms_resistance"], battery.series_resistance)  # its part of it
         # J in the current cooling period; idle: the motor's part that comes without current

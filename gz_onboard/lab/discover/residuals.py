@@ -310,7 +310,7 @@ def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The stator's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
     ambient = float(block_means(ride.quantities["ambient_temperature"], SLOW)[0])
-    network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
+    network = MotorCooling(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
     watts, *idle, _ = _heat(ride, p, system)
     return _warmed(ride, p, ("motor_temperature", "motor_airflow"), network, watts, idle)
 
@@ -318,7 +318,7 @@ def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
-    network = InverterCooling.of(p, board, board + p["box_start"])
+    network = InverterCooling(p, board, board + p["box_start"])
     return _warmed(ride, p, ("inverter_temperature", "inverter_airflow"), network, _heat(ride, p, system)[2])
 
 
@@ -328,5 +328,5 @@ def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     celsius = block_means(ride.quantities["cell_temperature"], SLOW)
     watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
     watts = watts + system.pack.reversible_heat(cell.current, cell.soc, celsius)
-    network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
+    network = LumpedCooling(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
     return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, watts)
