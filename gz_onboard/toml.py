@@ -6,6 +6,7 @@ import contextlib
 import re
 import tomllib
 from collections.abc import Collection, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ def _quoted(name: str) -> str:
 
 def _dotted(path: list[str]) -> str:
     return r"[ \t]*\.[ \t]*".join(map(_quoted, path))
+
+
+SMALLEST_STEP = 1e-6
 
 
 class Table:
@@ -164,6 +168,20 @@ class Table:
         """The list of numbers `key`, each within [low, high]; at least one, at most `LONGEST_LIST`."""
         numbers = self._list(key, f"must be a list of numbers, 1 to {LONGEST_LIST}")
         return tuple(self._number_of(number, key, low, high) for number in numbers)
+
+    def increasing(self, key: str, low: float, high: float, unit: str = "") -> tuple[float, ...]:
+        """The list of increasing numbers `key` in `unit`, each within [low, high].
+
+        Steps are `SMALLEST_STEP` or more: a slope over them must stay a number.
+        """
+        row, of = self.numbers(key), f" {unit}" if unit else ""
+        for x in row:
+            if not low <= x <= high:
+                raise self.error(f"{x:g}{of} is outside {low:g} to {high:g}{of}", key)
+        for a, b in pairwise(row):
+            if b - a < SMALLEST_STEP:
+                raise self.error(f"must increase, but {b:g}{of} follows {a:g}{of}", key)
+        return row
 
     def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
         """The list of rows of `columns` numbers `key`, each within [low, high]; `of` says what they are."""

@@ -19,6 +19,7 @@ from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.events import Group
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
@@ -26,9 +27,7 @@ from gz_onboard.vehicle import OWN, read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
 PLAIN = VEHICLE.pack
-COLD = replace(
-    PLAIN, rest_shift_temperature=(-10.0, 10.0, 25.0), rest_shift_value=(-0.03, -0.01, 0.0), rest_shift_sd=0.004
-)
+COLD = replace(PLAIN, rest_shift_curve=PiecewiseLinear((-10.0, 10.0, 25.0), (-0.03, -0.01, 0.0)), rest_shift_sd=0.004)
 TABLE = """
 [battery.rest_shift]
 temperature = [-10.0, 10.0, 25.0]
@@ -57,11 +56,7 @@ def read(folder: Path, table: str) -> Battery:
 
 def test_the_table_is_read(tmp_path):
     battery = read(tmp_path, TABLE)
-    assert (battery.rest_shift_temperature, battery.rest_shift_value, battery.rest_shift_sd) == (
-        COLD.rest_shift_temperature,
-        COLD.rest_shift_value,
-        COLD.rest_shift_sd,
-    )
+    assert (battery.rest_shift_curve, battery.rest_shift_sd) == (COLD.rest_shift_curve, COLD.rest_shift_sd)
     assert battery.rest_shift(0.0) == pytest.approx(-0.02)
     assert (battery.rest_shift(-40.0), battery.rest_shift(60.0)) == (-0.03, 0.0)
 
@@ -95,7 +90,7 @@ def test_without_the_table_the_same_bits(soc, temperature, power):
     assert PLAIN.ocv(soc, temperature) == PLAIN.ocv(soc)
     volts = PLAIN.ocv(soc)[0]
     assert PLAIN.soc_at(volts, temperature) == PLAIN.soc_at(volts)
-    flat = replace(COLD, rest_shift_value=(0.0, 0.0, 0.0))
+    flat = replace(COLD, rest_shift_curve=PiecewiseLinear((-10.0, 25.0), (0.0, 0.0)))
     assert flat.settled_current(power, soc, temperature) == PLAIN.settled_current(power, soc, temperature)
 
 
@@ -173,7 +168,7 @@ def test_what_the_circuit_errs_by_is_read_over_temperature(tmp_path):
     battery = read(tmp_path, ERRORS)
     assert battery.voltage_error(-20.0, 0.01) == pytest.approx(0.020)
     assert battery.voltage_error(7.5, 0.01) == pytest.approx(0.013)
-    without = replace(PLAIN, voltage_error_temperature=(), voltage_error_value=())
+    without = replace(PLAIN, voltage_error_curve=None)
     assert without.voltage_error(7.5, 0.01) == 0.01
     with pytest.raises(InputError, match=r"voltage_error.* 2 numbers within 0 to 0\.2 V"):
         read(tmp_path, ERRORS.replace("0.020", "-0.020"))

@@ -19,7 +19,7 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
-from gz_onboard.physics.functions import Mesh, Row, decay_over, extended, extended_over, linear, relaxed
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, Row, decay_over, extended, extended_over, relaxed
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
@@ -135,8 +135,7 @@ class Battery:
     cells_series: int
     cells_parallel: int
     capacity: float  # A·h of a cell at 25 degC
-    capacity_temperature: Row  # degC
-    capacity_share: Row  # of the capacity at 25 degC
+    capacity_share: PiecewiseLinear  # of the capacity at 25 degC, over degC
     cutoff_voltage: float  # V of a cell
     series_resistance: float  # ohm, of the pack beside its cells
     ocv_soc: Row
@@ -147,30 +146,20 @@ class Battery:
     c1: Mesh  # F
     resistance_factor: float = 1.0  # that is in r0, r1 and c1
     resistance_sd: float = 0.0  # relative, of that factor
-    rest_shift_temperature: Row = ()  # degC; none: V_oc does not depend on temperature
-    rest_shift_value: Row = ()  # V of a cell
+    rest_shift_curve: PiecewiseLinear | None = None  # V of a cell over degC; None: V_oc does not depend on temperature
     rest_shift_sd: float = 0.0  # V
     window: Window = field(default_factory=Window)
-    entropy_soc: Row = ()  # none: no reversible heat
-    entropy_value: Row = ()  # V/K of a cell
-    voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
-    voltage_error_value: Row = ()  # V of a cell, sd
-    voltage_error_time_temperature: Row = ()  # degC; none: it errs the same way for as long at all temperatures
-    voltage_error_time_value: Row = ()  # s
+    entropy: PiecewiseLinear | None = None  # V/K of a cell over SOC; None: no reversible heat
+    voltage_error_curve: PiecewiseLinear | None = None  # V of a cell, sd, over degC; None: the same at all temperatures
+    voltage_error_time_curve: PiecewiseLinear | None = None  # s, over degC; None: the same at all temperatures
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
     health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
-        fresh = self.capacity * linear(self.capacity_temperature, self.capacity_share, temperature)
+        fresh = self.capacity * self.capacity_share.at(temperature)
         return self.health.capacity * fresh
-
-    def capacity_share_over(self, temperature: Array) -> Array:
-        """The share of the capacity at 25 degC that there is at `temperature` (m,) [degC]."""
-        import numpy as np
-
-        return np.asarray(np.interp(temperature, self.capacity_temperature, self.capacity_share))
 
     def pack_capacity(self, temperature: float) -> float:
         """Capacity of the pack [A·h] at `temperature` [degC]."""
@@ -178,46 +167,35 @@ class Battery:
 
     def rest_shift(self, temperature: float) -> float:
         """How much higher [V] a cell rests at `temperature` [degC] than `ocv_value` says."""
-        if not self.rest_shift_value:
-            return 0.0
-        return linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+        return self.rest_shift_curve.at(temperature) if self.rest_shift_curve else 0.0
 
     def voltage_error(self, temperature: float, usual: float) -> float:
-        """By how much [V] the circuit errs at `temperature` [degC], one sd; `usual` [V] if that is not known."""
-        errors = self.voltage_error_value
-        return linear(self.voltage_error_temperature, errors, temperature) if errors else usual
+        """Error [V, sd] of the circuit at `temperature` [degC]; `usual` [V] if the file does not say."""
+        return self.voltage_error_curve.at(temperature) if self.voltage_error_curve else usual
 
     def voltage_error_time(self, temperature: float, usual: float) -> float:
-        """For how long [s] the circuit errs the same way at `temperature` [degC]; `usual` [s] if that is not known."""
-        times = self.voltage_error_time_value
-        return linear(self.voltage_error_time_temperature, times, temperature) if times else usual
+        """Correlation time [s] of that error at `temperature` [degC]; `usual` [s] if the file does not say."""
+        return self.voltage_error_time_curve.at(temperature) if self.voltage_error_time_curve else usual
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
         volts, slope = extended(self.ocv_soc, self.ocv_value, soc)
-        if temperature is not None and self.rest_shift_value:
+        if temperature is not None and self.rest_shift_curve:
             volts += self.rest_shift(temperature)
         return volts, slope
 
     def ocv_over(self, soc: Array, temperature: Array) -> Array:
         """`ocv` at `soc` and `temperature`, both (m,): values only."""
-        import numpy as np
-
         volts = extended_over(self.ocv_soc, self.ocv_value, soc)
-        if self.rest_shift_value:
-            volts = volts + np.interp(temperature, self.rest_shift_temperature, self.rest_shift_value)
+        if self.rest_shift_curve:
+            volts = volts + self.rest_shift_curve.over(temperature)
         return volts
 
     def reversible_heat(self, current: Any, soc: Any, temperature: Any) -> Any:
         """`reversible_heat` of the pack [W] at its `current` [A] and `temperature` [degC]; all floats, or all (n,)."""
-        if not self.entropy_soc:
+        if self.entropy is None:
             return 0.0 * current
-        if isinstance(soc, float):
-            entropy: Any = linear(self.entropy_soc, self.entropy_value, soc)
-        else:
-            import numpy as np
-
-            entropy = np.interp(soc, self.entropy_soc, self.entropy_value)
+        entropy: Any = self.entropy.at(soc) if isinstance(soc, float) else self.entropy.over(soc)
         return reversible_heat(self.cells_series * entropy, current, temperature)
 
     def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:

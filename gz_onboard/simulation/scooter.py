@@ -173,7 +173,7 @@ class Scooter:
         self._lever = p["cg_height"] / p["wheelbase"]
         rolls = p["wheel_inertia_front"] / self._radius**2  # the front wheel rolls without slip
         mass = roller.inertia if roller else model.mass + rolls
-        self._driveline = Driveline(tyre, brakes, mass, p["wheel_inertia_rear"], roller is None)
+        self.driveline = Driveline(tyre, brakes, mass, p["wheel_inertia_rear"], roller is None)
 
     @property
     def lean(self) -> float:
@@ -182,7 +182,7 @@ class Scooter:
 
     def kinetic_energy(self) -> float:
         """Of vehicle and wheels [J]."""
-        return self._driveline.kinetic_energy(self.speed, self.wheel_speed)
+        return self.driveline.kinetic_energy(self.speed, self.wheel_speed)
 
     def potential_energy(self) -> float:
         """Over the start [J]."""
@@ -209,7 +209,7 @@ class Scooter:
         absorbed = roller.absorbed(v) if roller else 0.0
         against = sum(forces) + front_share * total + turning + absorbed
 
-        dv, dw, force, braking, front_braking = self._driveline.step(
+        dv, dw, force, braking, front_braking = self.driveline.step(
             v, w, drive, against, share * total, self.rear_load, radius, brake, dt
         )
         v_mean, w_mean = v + dv / 2, w + dw / 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -240,7 +239,8 @@ def test_2_31_the_bms_stands_on_the_battery():
 def reaction_heat(scooter, celsius):
     """[J], of what was drawn from a charge of 0.7 on."""
     charge = 3600 * BATTERY.pack_capacity(celsius) * (0.7 - scooter.pack.soc)  # A·s
-    return -14 * charge * (celsius + 273.15) * float(np.interp(0.7, BATTERY.entropy_soc, BATTERY.entropy_value))
+    assert BATTERY.entropy
+    return -14 * charge * (celsius + 273.15) * BATTERY.entropy.at(0.7)
 
 
 def test_2_24_to_2_31_each_network_takes_its_own_heat():
@@ -350,7 +350,7 @@ def test_3_11_slip_of_the_default_form_settles_at_the_same():
 def test_3_10_force_is_friction_times_rear_load(riding):
     riding.step(0.4, 0.0)
     riding.step(0.4, 0.0)
-    mu, _ = riding.tyre.friction(riding.tyre.slip)
+    mu, _ = riding.driveline.tyre.friction(riding.driveline.tyre.slip)
     assert riding.force == pytest.approx(mu * riding.rear_load, rel=1e-3)
 
 

@@ -186,7 +186,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
     temperature = block_means(ride.quantities["cell_temperature"], SLOW)
     cold = colder(temperature)
-    capacity = p["cell_capacity"] * battery.capacity_share_over(temperature)
+    capacity = p["cell_capacity"] * battery.capacity_share.over(temperature)
     taken = discharged(cell, DT, capacity)
     soc = p["soc_start"] + start_soc(ride, system) - (np.cumsum(taken) - taken / 2)  # at the middle of each step
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
