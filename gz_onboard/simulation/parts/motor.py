@@ -16,16 +16,15 @@ class Losses:
     """The effects at one port, added up and booked a step of `dt` [s] at a time."""
 
     def __init__(self, effects: Sequence[Bound], dt: float) -> None:
-        self.names = [bound.effect.name for bound in effects]
+        self._names = [(i, bound.effect.name) for i, bound in enumerate(effects)]
         self._values, self._dt = stepper(effects, dt), dt
 
     def total(self, quantities: Mapping[str, float], ledger: Ledger) -> float:
         """Their sum [W]; adds each [J] to `ledger` by its name."""
-        total, dt = 0.0, self._dt
-        for name, watts in zip(self.names, self._values(quantities), strict=True):
-            ledger[name] += watts * dt
-            total += watts
-        return total
+        values, dt = self._values(quantities), self._dt
+        for i, name in self._names:
+            ledger[name] += values[i] * dt
+        return sum(values)
 
 
 class Motor(Protocol):
