@@ -31,7 +31,7 @@ KEYS = (
 
 
 @dataclass(frozen=True)
-class Limits:
+class TableLimits:
     """Bounds of what a battery table may say."""
 
     temperature: tuple[float, float] = (-60.0, 100.0)  # degC, of a cell
@@ -48,7 +48,7 @@ class Limits:
     as_new: tuple[float, float] = (0.01, 0.99)  # nothing could be learned of what is certain
 
 
-LIMITS = Limits()
+LIMITS = TableLimits()
 
 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
@@ -117,12 +117,12 @@ def _curve(battery: Table, name: str, axis: str, unit: str, bounds: tuple[float,
     """The table `name` of values in `unit` over its `axis`; None if the file does not have it."""
     if name not in battery.values:
         return None
-    table, (low, high) = battery.table(name), bounds
+    table = battery.table(name)
     table.only([axis, "value", "unit", "sd", "sd_relative", "source", "status"])
     table.text("unit", choices=[unit])
-    x, y = _axis(table, axis, getattr(LIMITS, axis), least=1), table.numbers("value")
-    if len(y) != len(x) or min(y) < low or max(y) > high:
-        raise table.error(f"must be {len(x)} numbers within {low:g} to {high:g} {unit}, one for each {axis}", "value")
+    x, y = _axis(table, axis, getattr(LIMITS, axis), least=1), table.numbers("value", *bounds)
+    if len(y) != len(x):
+        raise table.error(f"must be {len(x)} numbers, one for each {axis}", "value")
     return PiecewiseLinear(x, y)
 
 

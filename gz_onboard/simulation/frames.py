@@ -18,7 +18,7 @@ from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, latency, shaken, spread
+from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, SimulatedSensor, latency, shaken, spread
 from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle
 
@@ -129,7 +129,7 @@ def write_frames(out: Path, sent: list[Stream]) -> int:
 
 
 def _send(
-    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, dropouts: Dropouts
+    vehicle: Vehicle, message: Message, sensors: dict[str, SimulatedSensor], truth: Truth, seed: int, dropouts: Dropouts
 ) -> Stream:
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
@@ -171,7 +171,9 @@ def _send(
     return Stream(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
 
-def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
+def _values(
+    sensor: SimulatedSensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator
+) -> Floats:
     """What is read at `seconds`, in the unit of the DBC; not a number where there is no such sensor."""
     if sensor is None:
         return np.full(len(seconds), np.nan)

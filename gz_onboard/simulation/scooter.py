@@ -19,7 +19,7 @@ from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, M
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.functions import direction
 from gz_onboard.physics.model import air_density, drag_torque, stepper
-from gz_onboard.simulation.parts.battery import FirstOrderPack, Pack
+from gz_onboard.simulation.parts.battery import FirstOrderPack, PackModel
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.simulation.parts.controller import Controller
@@ -49,7 +49,7 @@ class Options(TypedDict, total=False):
     dt: float  # s; STEP
     heading: float | Callable[[float], float]  # rad clockwise from north: where the road begins, or over distance [m]
     vibration: float | Callable[[float], float] | None  # m/s²: how rough the road is, or over distance [m]
-    pack: Pack | None
+    pack: PackModel | None
     motor: Motor | None
     chassis: Chassis | None
     tyre_form: str  # transient; or steady, as the thesis prints it, see `Tyre`
@@ -123,7 +123,7 @@ class Scooter:
         self._q["cell_capacity"] = battery.cell_capacity(celsius)
         cells = model.at(Port.CELL_VOLTAGE)
         inside = stepper(cells, dt) if cells else None
-        self.pack: Pack = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
+        self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
         self._inverter = Losses(model.at(Port.INVERTER_LOSS), dt)
         self._dc = Losses(model.at(Port.DC_POWER), dt)
         constants = p["torque_constant"], p["voltage_constant"]

@@ -13,7 +13,7 @@ from gz_onboard.physics.functions import decay_over, extended, relaxed
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
 
-class Pack(Protocol):
+class PackModel(Protocol):
     """What the scooter needs of a battery pack."""
 
     soc: float
@@ -72,7 +72,7 @@ class FirstOrderPack:
         self._age = 0.0
 
     def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
-        """See `Pack`. The current is the root of V·I = P; where there is none, the current of greatest power."""
+        """See `PackModel`. The current is the root of V·I = P; where there is none, the current of greatest power."""
         if self._age >= TABLE_PERIOD - 1e-9 or dt != self._decay_dt:
             self._look_up(temperature, dt)
         self._age += dt
@@ -100,7 +100,7 @@ class FirstOrderPack:
         return current, voltage, heat(middle, voltage, current), voltage * current
 
     def chemical_energy_drawn(self) -> float:
-        """See `Pack`: the integral of V_oc over the charge between the SOC at the start and now.
+        """See `PackModel`: the integral of V_oc over the charge between the SOC at the start and now.
 
         From the SOC alone, not from what was delivered: the check of the energy balance stands on it.
         """

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.turning.leaning import LEAN_TIME, Leaning
-from gz_onboard.simulation.turning.machine import Machine, MachineState, Road
+from gz_onboard.simulation.turning.machine import Machine, MachineState, RoadConditions
 from gz_onboard.simulation.turning.planar import Planar
 
 MODELS: dict[str, type[Planar] | None] = {"straight": None, "planar": Planar, "leaning": Leaning}
@@ -107,7 +107,7 @@ def chassis(name: str, parameters: Mapping[str, float]) -> Chassis:
 
 def _steady_turns(model: Planar, speed: float, limit: float) -> list[Turn]:
     """The steady turns at `speed` [m/s], held by the drive, from straight on to `limit` [m/s²], to the left."""
-    m, road = model.machine, Road()
+    m, road = model.machine, RoadConditions()
     weight = m.weight(road)
     drag, _ = m.resistance(speed, road)
     upright = m.rolling(speed) * weight
@@ -156,5 +156,5 @@ def steady_turn(model: Planar, speed: float, rate: float) -> tuple[MachineState,
 
 def _drift(model: Planar, state: MachineState, steer: float) -> tuple[float, float]:
     """Rates of lateral speed and yaw rate, whose zero is the steady turn."""
-    change = model.rates(state, steer, None, Road()).change
+    change = model.rates(state, steer, None, RoadConditions()).change
     return change[1], change[2]
