@@ -51,6 +51,9 @@ from gz_onboard.errors import InputError, nearest, shown
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
+Values = Any
+"""A quantity, a term or a decay: a float, or an array (n,) over the steps of a ride."""
+
 
 class Port(Enum):
     """The place where an effect acts, with the unit of its term."""

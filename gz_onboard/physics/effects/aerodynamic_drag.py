@@ -1,10 +1,6 @@
 """Aerodynamic drag, F = ½·ρ·C_d·A·(V + V_w)·|V + V_w| (Lord 2016, eq. 3.1, with the sign kept in a tailwind)."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
@@ -27,7 +23,7 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, headwind: Any, air_density: Any, *, drag_area: float) -> Any:
+def term(speed: Values, headwind: Values, air_density: Values, *, drag_area: float) -> Values:
     """Force [N] against the motion."""
     flow = speed + headwind
     return 0.5 * air_density * drag_area * flow * abs(flow)

@@ -1,10 +1,6 @@
 """Auxiliary load behind the DC-DC converter: lamps, dashboard, control (Lord 2016, eq. 2.19)."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import ELECTRONICS, Parameter, Port
+from gz_onboard.physics.effect import ELECTRONICS, Parameter, Port, Values
 
 PORT = Port.DC_POWER
 PARAMETERS = (
@@ -24,6 +20,6 @@ CAUSE = ("auxiliary_load", "P = P_aux")
 SHOWN_BY = "The auxiliary current sensor, at standstill too; switching lamps one by one splits it from the sensor."
 
 
-def term(*, auxiliary_power: float) -> Any:
+def term(*, auxiliary_power: float) -> Values:
     """Power [W] drawn from the pack."""
     return auxiliary_power

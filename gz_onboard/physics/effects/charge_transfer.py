@@ -6,12 +6,8 @@ cell's resistance falls with the current. R_ct, its slope at no current, falls w
 where one electrode is by far the slower and 2 where both are alike: the more, the less it bends.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN, THERMAL_VOLTAGE
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.functions import asinh, exp
 
 PORT = Port.CELL_VOLTAGE
@@ -66,13 +62,13 @@ STRENGTHS = ()  # pulses of several currents show it; a ride shows it as resista
 
 
 def term(
-    cell_current: Any,
-    cell_temperature: Any,
+    cell_current: Values,
+    cell_temperature: Values,
     *,
     charge_transfer_resistance: float,
     charge_transfer_activation: float,
     charge_transfer_reactions: float,
-) -> Any:
+) -> Values:
     """What the terminals lack [V] once settled."""
     kelvin = cell_temperature + KELVIN
     thermal = charge_transfer_reactions * 2 * THERMAL_VOLTAGE * kelvin
@@ -80,6 +76,6 @@ def term(
     return thermal * asinh(charge_transfer_resistance * arrhenius * cell_current / thermal)
 
 
-def decay(dt: Any, *, charge_transfer_time: float) -> Any:
+def decay(dt: Values, *, charge_transfer_time: float) -> Values:
     """The share that is left after `dt` [s]."""
     return exp(-dt / charge_transfer_time)

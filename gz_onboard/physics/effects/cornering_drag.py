@@ -7,12 +7,8 @@ sec. 1.3). Stiffness grows with load, so one number is left: c = s_f/c_f + s_r/c
 at small angles with a_y² too: c then is what both take together.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.functions import direction
 
 PORT = Port.WHEEL_FORCE
@@ -36,6 +32,6 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, mass: Any, lateral_acceleration: Any, *, cornering_compliance: float) -> Any:
+def term(speed: Values, mass: Values, lateral_acceleration: Values, *, cornering_compliance: float) -> Values:
     """Force [N] against the motion."""
     return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / GRAVITY * direction(speed)

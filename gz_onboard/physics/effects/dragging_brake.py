@@ -3,11 +3,7 @@
 Coulomb friction of pads that do not come free (Limpert 2011, Brake Design and Safety). Smooth around standstill.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import MASS, Parameter, Port
+from gz_onboard.physics.effect import MASS, Parameter, Port, Values
 from gz_onboard.physics.functions import direction
 
 PORT = Port.WHEEL_FORCE
@@ -31,6 +27,6 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, *, brake_drag_force: float) -> Any:
+def term(speed: Values, *, brake_drag_force: float) -> Values:
     """Force [N] against the motion."""
     return brake_drag_force * direction(speed)

@@ -4,11 +4,7 @@ The viscous part of a bearing's friction torque grows with its speed (Harris & K
 sec. 10.3); unlike the tyres' it does not grow with the load.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import ROTATION, Parameter, Port
+from gz_onboard.physics.effect import ROTATION, Parameter, Port, Values
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
@@ -31,6 +27,6 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, *, drivetrain_drag_torque: float, wheel_radius: float) -> Any:
+def term(speed: Values, *, drivetrain_drag_torque: float, wheel_radius: float) -> Values:
     """Force [N] against the motion."""
     return drivetrain_drag_torque * speed / (wheel_radius * wheel_radius)

@@ -1,10 +1,6 @@
 """Inverter loss, P = c0 + c1·|i_m| + c2·i_m²: gate drive, switching and conduction (Lord 2016, eqs. 2.1-2.6)."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import ELECTRONICS, MOTOR_RESISTANCE, Parameter, Port
+from gz_onboard.physics.effect import ELECTRONICS, MOTOR_RESISTANCE, Parameter, Port, Values
 
 PORT = Port.INVERTER_LOSS
 PARAMETERS = (
@@ -54,8 +50,8 @@ SHOWN_BY = (
 
 
 def term(
-    motor_current: Any, *, inverter_loss_constant: float, inverter_loss_linear: float, inverter_loss_quadratic: float
-) -> Any:
+    motor_current: Values, *, inverter_loss_constant: float, inverter_loss_linear: float, inverter_loss_quadratic: float
+) -> Values:
     """Heat [W]."""
     return (
         inverter_loss_constant

@@ -4,12 +4,8 @@ The share f·ω² is that of eddy currents in the winding, which grow with the s
 effect while the wire is thinner than the skin: Sullivan 2001).
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.physics.effect import MOTOR_RESISTANCE, Parameter, Port
+from gz_onboard.physics.effect import MOTOR_RESISTANCE, Parameter, Port, Values
 
 PORT = Port.MOTOR_LOSS
 PARAMETERS = (
@@ -48,14 +44,14 @@ SHOWN_BY = (
 
 
 def term(
-    motor_current: Any,
-    motor_temperature: Any,
-    motor_speed: Any,
+    motor_current: Values,
+    motor_temperature: Values,
+    motor_speed: Values,
     *,
     motor_copper_resistance: float,
     motor_copper_temperature_coefficient: float,
     motor_copper_frequency: float,
-) -> Any:
+) -> Values:
     """Heat [W]."""
     return (
         motor_copper_resistance
@@ -67,8 +63,8 @@ def term(
 
 
 def variation(
-    motor_speed: Any, *, copper_speed: float, motor_copper_resistance: float, healthy_motor_copper_resistance: float
-) -> Any:
+    motor_speed: Values, *, copper_speed: float, motor_copper_resistance: float, healthy_motor_copper_resistance: float
+) -> Values:
     """Eddy currents grow with frequency in the healthy winding, not in what a fault adds; copper_speed: at `SCALE`."""
     own = healthy_motor_copper_resistance / motor_copper_resistance
     return 1 + own * copper_speed * abs(motor_speed) / SCALE

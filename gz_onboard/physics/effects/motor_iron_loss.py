@@ -1,10 +1,6 @@
 """Iron and drag loss of the motor: hysteresis and bearings with speed, eddy currents with its square."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import TORQUE, Parameter, Port
+from gz_onboard.physics.effect import TORQUE, Parameter, Port, Values
 
 PORT = Port.MOTOR_LOSS
 PARAMETERS = (
@@ -35,6 +31,6 @@ PARAMETERS = (
 )
 
 
-def term(motor_speed: Any, *, motor_iron_linear: float, motor_iron_quadratic: float) -> Any:
+def term(motor_speed: Values, *, motor_iron_linear: float, motor_iron_quadratic: float) -> Values:
     """Heat [W]."""
     return motor_iron_linear * abs(motor_speed) + motor_iron_quadratic * motor_speed * motor_speed

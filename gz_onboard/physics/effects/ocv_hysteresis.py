@@ -4,12 +4,8 @@ At rest the voltage depends on whether the cell was charged or discharged before
 and stays where it is at rest. Positive when discharging. The sign is smooth below 10 mA of a cell.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.physics.battery import discharged
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.functions import exp
 
 PORT = Port.CELL_VOLTAGE
@@ -34,11 +30,11 @@ SHOWN_BY = (
 SMALL = 0.01  # A
 
 
-def term(cell_current: Any, *, hysteresis_voltage: float) -> Any:
+def term(cell_current: Values, *, hysteresis_voltage: float) -> Values:
     """What the terminals lack [V] once settled."""
     return hysteresis_voltage * cell_current / (cell_current * cell_current + SMALL * SMALL) ** 0.5
 
 
-def decay(dt: Any, cell_current: Any, cell_capacity: Any, *, hysteresis_rate: float) -> Any:
+def decay(dt: Values, cell_current: Values, cell_capacity: Values, *, hysteresis_rate: float) -> Values:
     """The share that is left after `dt` [s] of `cell_current` [A]."""
     return exp(-hysteresis_rate * discharged(abs(cell_current), dt, cell_capacity))

@@ -4,11 +4,7 @@ A share of the mechanical power that the motor takes while it brakes; Lord 2016,
 directions. What a controller does at braking alone, such as braking against its own field, is in none of its maps.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 
 PORT = Port.INVERTER_LOSS
 PARAMETERS = (
@@ -30,7 +26,7 @@ SHOWN_BY = (
 )
 
 
-def term(torque: Any, motor_speed: Any, *, regeneration_loss_share: float) -> Any:
+def term(torque: Values, motor_speed: Values, *, regeneration_loss_share: float) -> Values:
     """Heat [W]."""
     power = torque * motor_speed
     return regeneration_loss_share * (abs(power) - power) / 2

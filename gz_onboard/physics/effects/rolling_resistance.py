@@ -3,12 +3,8 @@
 Smooth around standstill: the constant term fades below 0.1 m/s, where a scooter that stands is held, not driven.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import GRAVITY, MILD
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.functions import direction
 
 PORT = Port.TYRE
@@ -42,8 +38,13 @@ SHOWN_BY = (
 
 
 def term(
-    speed: Any, mass: Any, grade_cosine: Any, *, rolling_resistance_constant: float, rolling_resistance_speed: float
-) -> Any:
+    speed: Values,
+    mass: Values,
+    grade_cosine: Values,
+    *,
+    rolling_resistance_constant: float,
+    rolling_resistance_speed: float,
+) -> Values:
     """Force [N] against the motion."""
     return (
         mass
@@ -53,6 +54,6 @@ def term(
     )
 
 
-def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
+def variation(ambient_temperature: Values, *, rolling_cold: float) -> Values:
     """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
     return 1 + rolling_cold * (MILD - ambient_temperature) / MILD

@@ -4,11 +4,7 @@ Diffusion in the particles goes on for the better part of an hour after the curr
 Management Systems, vol. 1, sec. 2.4; Hu, Li & Peng 2012 compare circuits of one and two pairs).
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.functions import exp
 
 PORT = Port.CELL_VOLTAGE
@@ -33,11 +29,11 @@ SHOWN_BY = (
 )
 
 
-def term(cell_current: Any, *, slow_resistance: float) -> Any:
+def term(cell_current: Values, *, slow_resistance: float) -> Values:
     """What the terminals lack [V] once settled."""
     return slow_resistance * cell_current
 
 
-def decay(dt: Any, *, slow_time: float) -> Any:
+def decay(dt: Values, *, slow_time: float) -> Values:
     """The share that is left after `dt` [s]."""
     return exp(-dt / slow_time)

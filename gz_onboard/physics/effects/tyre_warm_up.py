@@ -3,11 +3,7 @@
 Rubber loses less as it warms: ISO 28580 has a tyre run for half an hour before its rolling resistance is measured.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.effects.rolling_resistance import term as rolling
 from gz_onboard.physics.functions import exp
 
@@ -41,15 +37,15 @@ SHOWN_BY = (
 
 
 def term(
-    speed: Any,
-    mass: Any,
-    grade_cosine: Any,
-    time_moving: Any,
+    speed: Values,
+    mass: Values,
+    grade_cosine: Values,
+    time_moving: Values,
     *,
     rolling_resistance_constant: float,
     warm_up_share: float,
     warm_up_time: float,
-) -> Any:
+) -> Values:
     """Force [N] against the motion."""
     more = rolling_resistance_constant * warm_up_share * exp(-time_moving / warm_up_time)
     return rolling(speed, mass, grade_cosine, rolling_resistance_constant=more, rolling_resistance_speed=0.0)
