@@ -2,13 +2,13 @@
 
     dSOC/dt = -I/(3600·Ah)      dV1/dt = -V1/(R1·C1) + I/C1      V = V_oc(SOC, T) - R0·I - V1
 
-with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature; V_oc goes on
-beyond full and empty along its last slope, so that an estimate that strays there is still shown its way back. A cold
-cell rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is what it loses (eq. 2.24) and, with
-`entropy` over SOC, what the reaction gives or takes as heat without loss.
+with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature. V_oc continues
+beyond full and empty along its last slope, so that an estimate that strays there still finds its way back. A cold cell
+rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is its loss (eq. 2.24) and, with `entropy`
+over SOC, the reversible heat of the reaction.
 
-The functions are the equations, of floats and of numpy arrays alike; who simulates, estimates, calibrates, validates
-or discovers calls them. The RC pair is `physics.functions`.
+Simulation, estimator, calibration, validation and discovery all call these equations, for floats and numpy arrays
+alike. The RC pair is the lag of `physics.functions`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Overpotential = Callable[[float, float, float, float], float]
-"""What a cell's voltage lacks [V] beside R0 and the RC pair, in the mean: of a cell's mean current [A], SOC,
-temperature [degC] and form factor squared, see `Battery.settled_current`."""
+"""Mean voltage [V] that a cell loses beyond R0 and the RC pair: a function of its mean current [A], SOC, temperature
+[degC] and form factor squared, see `Battery.settled_current`."""
 HALF_FULL = 0.5  # SOC that is taken where it is not known
 MOST_SOC_SD = 0.3  # a SOC of which nothing is known lies between 0 and 1: that is 0.29
 QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
@@ -51,9 +51,9 @@ def current_of(power: float, source: float, resistance: float) -> float | None:
 
 
 def heat(rest: Any, terminal: Any, current: Any) -> Any:
-    """Heat [W]: what leaves the chemistry and not the terminals (eq. 2.24; as printed it mixes cell and pack).
+    """Heat [W]: power of the chemistry less that at the terminals (eq. 2.24; as printed it mixes cell and pack).
 
-    It counts what the RC pair's capacitor stores for a minute as heat, as the printed form does.
+    Energy that the RC pair's capacitor stores for a minute counts as heat, as in the printed form.
     """
     return (rest - terminal) * current
 
@@ -61,8 +61,8 @@ def heat(rest: Any, terminal: Any, current: Any) -> Any:
 def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
     """Heat [W] of the change of order in the electrodes, -I·T·dU/dT (Bernardi 1985); cold if it is negative.
 
-    entropy: dU/dT of the open-circuit voltage [V/K]; temperature in degC. It changes its sign with the current's, and
-    is in no voltage: what a cell delivers it takes from its surroundings.
+    entropy: dU/dT of the open-circuit voltage [V/K]; temperature in degC. Its sign changes with the current's. It does
+    not show in the voltage: the cell exchanges this heat with its surroundings.
     """
     return -entropy * current * (temperature + KELVIN)
 
@@ -70,8 +70,8 @@ def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
 def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
     """Heat [W] of a cell's resistors alone; current_squared: mean square of its current [A²].
 
-    It is `heat` but for what the RC pair's capacitor takes in and gives back; over a ride both sum to the same. This
-    one takes bursts faster than its steps, by their mean square.
+    It is `heat` without the energy that the RC pair's capacitor takes in and gives back; over a ride both have the same
+    sum. The mean square includes bursts faster than the steps.
     """
     return r0 * current_squared + v1 * v1 / r1
 
@@ -94,7 +94,7 @@ class Window:
         return min(max((soc - self.low) / width, 0.0), 1.0), min(sqrt(sd * sd + self.sd**2) / width, MOST_SOC_SD)
 
     def of_cells(self, shown: float) -> float:
-        """The cells' state of charge for what the vehicle shows."""
+        """The cells' state of charge for the vehicle's."""
         return self.low + shown * (self.high - self.low)
 
 
@@ -121,9 +121,9 @@ class Health:
     weakest: WeakGroup | None = None  # None: all groups are taken to be alike
 
     def carried(self, current: float, ages: float) -> float:
-        """The current [A] that a cell as new would carry: of what has aged less is left to carry `current`.
+        """The current [A] by which an effect that ages less makes the loss of the aged cell at `current` [A].
 
-        ages: the share of what it meets that ages so.
+        ages: the share of the effect that grows with the resistance.
         """
         return (1 + (self.resistance - 1) * ages) * current
 
@@ -218,7 +218,7 @@ class Battery:
     def soc_at_load(self, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:
         """The SOC of a cell with this `voltage` [V] at a `current` [A] and `temperature` [degC]; v1 [V]: its RC pair's.
 
-        It may be below 0 or above 1, as the open-circuit voltage goes on there.
+        It may be below 0 or above 1, where the open-circuit voltage continues.
         """
         soc = HALF_FULL
         for _ in range(SOC_ROUNDS):
@@ -257,7 +257,7 @@ class Battery:
         return terminal_voltage(ocv, r0, current, v1), slope - current * r0_slope
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
-        """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""
+        """The same battery with capacity, cut-off and resistances of a vehicle's `parameters`."""
         factor = parameters["cell_resistance_factor"]
         battery = replace(
             self,
@@ -319,8 +319,8 @@ class Battery:
         """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
 
         form_factor_squared: the mean square of the current over the square of its mean: in traffic the current comes
-        in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: what a cell's
-        voltage lacks beside R0 and the RC pair.
+        in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: voltage that a cell
+        loses beyond R0 and the RC pair.
         """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc, temperature)[0]

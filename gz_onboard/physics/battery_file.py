@@ -32,7 +32,7 @@ KEYS = (
 
 @dataclass(frozen=True)
 class TableLimits:
-    """Bounds of what a battery table may say."""
+    """Bounds of the values in battery tables."""
 
     temperature: tuple[float, float] = (-60.0, 100.0)  # degC, of a cell
     soc: tuple[float, float] = (-0.01, 1.01)

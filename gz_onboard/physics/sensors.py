@@ -1,4 +1,4 @@
-"""What the vehicle's own sensors show, and what is: offset, gain and scale that its file knows are taken off here.
+"""Readings of the vehicle's sensors, corrected for the offset, gain and scale that its file gives.
 
 The functions take floats and arrays alike; `parameters` are those of the vehicle.
 """
@@ -23,26 +23,26 @@ VIBRATION_MEMORY_S = 2.0  # over which the mean of the square goes
 
 
 def true_current(reading: Any, parameters: Mapping[str, float]) -> Any:
-    """The pack's current [A] of which the sensor shows `reading` [A]."""
+    """The pack's current [A] at a `reading` [A] of its sensor."""
     return (reading - parameters["pack_current_offset"]) / parameters["pack_current_gain"]
 
 
 def true_voltage(reading: Any, parameters: Mapping[str, float]) -> Any:
-    """The pack's voltage [V] of which the sensor shows `reading` [V]."""
+    """The pack's voltage [V] at a `reading` [V] of its sensor."""
     return reading - parameters["pack_voltage_offset"]
 
 
 def true_motor_speed(reading: Any, parameters: Mapping[str, float]) -> Any:
-    """The motor's speed of which the sensor shows `reading`, in the same unit."""
+    """The motor's speed at a `reading` of its sensor, in the same unit."""
     return reading / parameters["speed_sensor_scale"]
 
 
 TRUE = {"pack_current": true_current, "pack_voltage": true_voltage, "motor_speed": true_motor_speed}
-"""What is, out of what is shown, by role; other sensors have no error that a file knows."""
+"""Corrections by role; a file gives no errors of other sensors."""
 
 
 def true_columns(columns: Columns, parameters: Mapping[str, float]) -> dict[str, tuple[Array, Array]]:
-    """The columns of a ride (times and values by role) with what the sensors are known to err by taken off."""
+    """The columns of a ride (times and values by role), corrected for known errors of the sensors."""
     return {role: (t, TRUE[role](v, parameters) if role in TRUE else v) for role, (t, v) in columns.items()}
 
 
@@ -57,13 +57,14 @@ def grade_shown(forward: Any, acceleration: Any) -> Any:
 
 
 def speed_factors(radius: float, gear: float) -> dict[str, float]:
-    """What makes m/s of a true speed, by role, the best first. radius of the wheel [m]; gear: wheel over motor."""
+    """Factors from a true speed to m/s, by role, the best first. radius: of the wheel [m]. gear: wheel over motor."""
     return dict(zip(SPEEDS, (radius * gear, radius, radius, 1.0, 1.0), strict=True))
 
 
 def speed_role(name: str, columns: Columns, parameters: Mapping[str, float]) -> tuple[str, float]:
-    """(the best speed among the true `columns` of ride `name`, the factor that makes m/s of it): motor or wheel, before
-    what is told of the vehicle. InputError if there is none.
+    """(role of the best speed among the true `columns` of ride `name`, factor from it to m/s).
+
+    Motor and wheel come before reported speeds. InputError if there is no speed.
     """
     factors = speed_factors(parameters["wheel_radius"], parameters["gear_ratio"])
     del factors["wheel_speed_front"]  # the discovery compares it with that of the driven wheel

@@ -1,4 +1,4 @@
-"""Charge transfer of a cell: what the reaction takes, U·asinh(R_ct·I/U) with U = n·2RT/F, settling in seconds.
+"""Charge transfer of a cell: overpotential of the reaction, U·asinh(R_ct·I/U) with U = n·2RT/F, settling in seconds.
 
 Butler's and Volmer's equation of two equal coefficients, solved for the overpotential (Plett 2015, Battery Management
 Systems, vol. 1, sec. 3.11); it settles as the double layer is charged. It grows less than the current, so that a cold
@@ -69,7 +69,7 @@ def term(
     charge_transfer_activation: float,
     charge_transfer_reactions: float,
 ) -> Values:
-    """What the terminals lack [V] once settled."""
+    """Voltage lost [V] once settled."""
     kelvin = cell_temperature + KELVIN
     thermal = charge_transfer_reactions * 2 * THERMAL_VOLTAGE * kelvin
     arrhenius = exp(charge_transfer_activation * (1 / kelvin - 1 / (BENCH_TEMPERATURE + KELVIN)))

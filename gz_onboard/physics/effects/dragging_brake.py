@@ -1,4 +1,4 @@
-"""A brake that drags, F = F_b while the vehicle moves: pads rub with a force of their own, whatever the load.
+"""A brake that drags, F = F_b while the vehicle moves: pads rub with the same force at any load.
 
 Coulomb friction of pads that do not come free (Limpert 2011, Brake Design and Safety). Smooth around standstill.
 """

@@ -1,4 +1,4 @@
-"""Weight along the road, F = m·g·sin θ (Lord 2016, eq. 3.2). Gives back downhill what it took uphill."""
+"""Weight along the road, F = m·g·sin θ (Lord 2016, eq. 3.2). Returns downhill the energy taken uphill."""
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port, Values

@@ -65,6 +65,6 @@ def term(
 def variation(
     motor_speed: Values, *, copper_speed: float, motor_copper_resistance: float, healthy_motor_copper_resistance: float
 ) -> Values:
-    """Eddy currents grow with frequency in the healthy winding, not in what a fault adds; copper_speed: at `SCALE`."""
+    """Eddy currents grow with frequency in the healthy winding, not in a fault; copper_speed: share at `SCALE`."""
     own = healthy_motor_copper_resistance / motor_copper_resistance
     return 1 + own * copper_speed * abs(motor_speed) / SCALE

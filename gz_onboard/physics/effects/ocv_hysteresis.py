@@ -31,7 +31,7 @@ SMALL = 0.01  # A
 
 
 def term(cell_current: Values, *, hysteresis_voltage: float) -> Values:
-    """What the terminals lack [V] once settled."""
+    """Voltage lost [V] once settled."""
     return hysteresis_voltage * cell_current / (cell_current * cell_current + SMALL * SMALL) ** 0.5
 
 

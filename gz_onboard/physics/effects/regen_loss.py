@@ -1,7 +1,7 @@
 """Loss of recovered power, P = s·max(-τ·ω, 0): braking gives back less than losses in both directions say.
 
 A share of the mechanical power that the motor takes while it brakes; Lord 2016, eqs. 2.1-2.6, has one loss for both
-directions. What a controller does at braking alone, such as braking against its own field, is in none of its maps.
+directions. Its maps do not include losses of a controller at braking alone, such as braking against its own field.
 """
 
 from gz_onboard.physics.effect import Parameter, Port, Values

@@ -1,6 +1,6 @@
-"""Slow relaxation of a cell, a second RC pair: τ·dV2/dt = R2·I - V2; what one RC pair lacks (Lord 2016, sec. 3.3).
+"""Slow relaxation of a cell, a second RC pair: τ·dV2/dt = R2·I - V2; missing in Lord 2016 (sec. 3.3).
 
-Diffusion in the particles goes on for the better part of an hour after the current has changed (Plett 2015, Battery
+Diffusion in the particles lasts for the better part of an hour after the current has changed (Plett 2015, Battery
 Management Systems, vol. 1, sec. 2.4; Hu, Li & Peng 2012 compare circuits of one and two pairs).
 """
 
@@ -30,7 +30,7 @@ SHOWN_BY = (
 
 
 def term(cell_current: Values, *, slow_resistance: float) -> Values:
-    """What the terminals lack [V] once settled."""
+    """Voltage lost [V] once settled."""
     return slow_resistance * cell_current
 
 
