@@ -39,7 +39,7 @@ VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag wo
 
 
 class Options(TypedDict, total=False):
-    """How a simulation begins, and the parts that stand in for the vehicle's own."""
+    """Start of a simulation, and parts that replace the vehicle's own."""
 
     soc: float  # 1 if not given
     ambient: float  # degC; 20
@@ -59,10 +59,10 @@ class Options(TypedDict, total=False):
 class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
-    `pack`, `motor`, `chassis` may be replaced by any object with the methods of `Pack`, `Motor`, `Chassis`; a chassis
-    that turns is refused (InputError) beside an effect that is the same loss. The other parts are attributes, to be
-    set before the first step; effects of the model in the cells act in the own pack only. Without `vibration` a road
-    is as rough as the vehicle's file expects, and a roller smooth. `heading` by a number turns with the road.
+    `pack`, `motor`, `chassis` may be any objects with the methods of `PackModel`, `Motor`, `Chassis`. A chassis that
+    turns is refused (InputError) together with an effect that is the same loss. Effects of the model in the cells act
+    in `FirstOrderPack` only. Without `vibration` a road is as rough as the vehicle's file expects, and a roller smooth.
+    `heading` by a number turns with the road.
     """
 
     def __init__(

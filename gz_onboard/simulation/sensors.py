@@ -1,7 +1,7 @@
-"""What the reference scooter's sensors make of a simulated ride: values with gain, offset, noise and delay.
+"""Readings of the reference scooter's sensors in a simulated ride: with gain, offset, noise and delay.
 
-`trace` keeps the scooter's states; `SENSORS` says for each signal of the scooter's DBC files what of
-it is sensed and how well. Figures are those of docs/reference-scooter.md; where that has none, a guess of this file.
+`trace` keeps the scooter's states; `SENSORS` gives the sensor of each signal of the scooter's DBC files.
+Figures are those of docs/reference-scooter.md, or guesses where that has none.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ ROLLER: tuple[SimulatedSensor, ...] = (
 
 
 def shaken(sensor: SimulatedSensor, truth: Truth, period: float) -> Array | None:
-    """The standard deviation of what the road shakes into the sensor [its unit] at each step; None if it does not.
+    """Standard deviation of the vibration of the road at the sensor [its unit] at each step; None without any.
 
     White, sampled each `period` [s], of the size that `physics.sensors.Vibration` makes the truth's vibration of.
     """

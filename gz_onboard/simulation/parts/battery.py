@@ -14,7 +14,7 @@ TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; bo
 
 
 class PackModel(Protocol):
-    """What the scooter needs of a battery pack."""
+    """A battery pack, as the scooter uses it."""
 
     soc: float
 
@@ -102,7 +102,7 @@ class FirstOrderPack:
     def chemical_energy_drawn(self) -> float:
         """See `PackModel`: the integral of V_oc over the charge between the SOC at the start and now.
 
-        From the SOC alone, not from what was delivered: the check of the energy balance stands on it.
+        It follows from the SOC alone, not from the energy delivered: the check of the energy balance relies on it.
         """
         return self._drawn + self._between(self._soc_before, self.soc)
 

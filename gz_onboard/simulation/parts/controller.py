@@ -1,6 +1,6 @@
 """The motor controller: current by throttle, limited by speed, temperature, voltage and state of charge.
 
-The thesis names it and does not give it (it is proprietary): the derating tables of the vehicle file stand in.
+The thesis names it and does not give it (it is proprietary). The derating tables of the vehicle file replace it.
 """
 
 from __future__ import annotations

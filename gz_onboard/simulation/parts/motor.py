@@ -13,7 +13,7 @@ Ledger = MutableMapping[str, float]
 
 
 class Losses:
-    """The effects at one port, added up and booked a step of `dt` [s] at a time."""
+    """The effects at one port, summed and booked once each step of `dt` [s]."""
 
     def __init__(self, effects: Sequence[Bound], dt: float) -> None:
         self._names = [(i, bound.effect.name) for i, bound in enumerate(effects)]
@@ -28,7 +28,7 @@ class Losses:
 
 
 class Motor(Protocol):
-    """What the scooter needs of a motor."""
+    """A motor, as the scooter uses it."""
 
     torque_constant: float  # N·m/A (eq. 2.8)
     voltage_constant: float  # V·s/rad, line to line, RMS (eq. 2.7)
@@ -37,13 +37,13 @@ class Motor(Protocol):
         """Heat [W] at a shaft speed [rad/s], current [A] and temperature [degC]; books each loss of `dt` [s]."""
 
     def idle(self, speed: float, temperature: float) -> float:
-        """What it loses [W] turning without current: it is drag, which slows the shaft."""
+        """Loss [W] turning without current: drag, which slows the shaft."""
 
 
 class EffectMotor:
-    """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists.
+    """A motor whose losses are effects of the vehicle's model: copper, iron, and others that its file lists.
 
-    quantities: what the effects read.
+    quantities: read by the effects.
     """
 
     def __init__(

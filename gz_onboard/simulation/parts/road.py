@@ -1,4 +1,4 @@
-"""What the scooter stands on: a road, or the roller of a chassis dynamometer."""
+"""The road under the scooter, or the roller of a chassis dynamometer."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Two forms of slip. ``steady`` is the printed one, κ = (V_t - V)/max(V, V_t, ε). ``transient``, the default, lets the
 carcass take up the slip over a relaxation length, σ·dκ/dt = V_t - V - |V|·κ (Pacejka 2012, eq. 7.9): the same at
-speed, and at standstill a spring instead of a singularity, so that a braked scooter stands on a hill.
+speed, and at standstill a spring instead of a singularity, so that a braked scooter holds on a hill.
 """
 
 from __future__ import annotations
