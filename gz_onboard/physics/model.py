@@ -83,11 +83,11 @@ def _reader(names: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[[
     return eval(f"lambda function: lambda q: {_call('function', names)}")  # type: ignore[no-any-return]
 
 
-def stepper(effects: Sequence[Bound], dt: float) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
     """A function from quantities (floats) to the values of `effects`, to be called once each step of `dt` [s].
 
-    Effects with memory start from 0. The function is written out as source, without loops and layers of calls:
-    a simulation calls it a hundred times for each second ridden.
+    Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
+    loops and layers of calls: a simulation calls it a hundred times for each second ridden.
     """
     scope: dict[str, Any] = {}
     lines = []
@@ -95,7 +95,7 @@ def stepper(effects: Sequence[Bound], dt: float) -> Callable[[Mapping[str, float
         decay = bound.effect.decay
         scope[f"term{i}"] = bound.bare_term
         call = _call(f"term{i}", bound.effect.term.quantities)
-        if decay and bound.bare_decay:
+        if decay and bound.bare_decay and dt is not None:
             scope[f"value{i}"], scope[f"decay{i}"] = 0.0, partial(bound.bare_decay, dt)
             if not decay.quantities:
                 scope[f"kept{i}"] = bound.bare_decay(dt)

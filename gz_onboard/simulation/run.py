@@ -224,7 +224,8 @@ def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Co
 
     def command(scooter: Scooter) -> tuple[float, float, float]:
         wanted = speeds[round(scooter.time / dt) % count]
-        return *rider.step(wanted, scooter.speed, dt), wanted
+        throttle, brake = rider.step(wanted, scooter.speed, dt)
+        return throttle, brake, wanted
 
     return command
 
@@ -247,7 +248,8 @@ def along(metres: Sequence[float]) -> Command:
     def command(scooter: Scooter) -> tuple[float, float, float]:
         ahead = scooter.distance + 0.5 * scooter.speed
         wanted = max(metres[min(max(int(ahead), 0), last)], 1.0)
-        return *rider.step(wanted, scooter.speed, scooter.dt), wanted
+        throttle, brake = rider.step(wanted, scooter.speed, scooter.dt)
+        return throttle, brake, wanted
 
     return command
 

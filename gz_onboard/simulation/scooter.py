@@ -255,16 +255,16 @@ class Scooter:
         else:
             shift = self.force * self._lever
         rear = normal * self._rear_share + shift
-        self.rear_load = min(max(rear, LEAST_LOAD * normal), normal)
-        self.front_load = normal - self.rear_load
+        least = LEAST_LOAD * normal
+        self.rear_load = rear = least if rear < least else normal if rear > normal else rear
+        self.front_load = normal - rear
         return normal, turning, radius
 
     def _draw(self, mechanical: float, motor_speed: float, current: float) -> None:
         """Every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19), and its heat."""
         dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
-        q["torque"] = self.motor.torque_constant * current
+        q["motor_speed"], q["motor_current"], q["torque"] = motor_speed, current, self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
-        q["motor_speed"], q["motor_current"] = motor_speed, current
         inverter_heat = self._inverter.total(q, entries)
         power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries)
         self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)

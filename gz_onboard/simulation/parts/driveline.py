@@ -63,9 +63,11 @@ class Driveline:
             for _ in range(BRAKE_PASSES):
                 if self.has_front_wheel:
                     to_stop = (v + by_force * f1 + across * (f2 - braking)) / by_force
-                    front_braking = min(max(to_stop, front_least), front_most)
+                    limited = front_most if to_stop > front_most else to_stop
+                    front_braking = front_least if limited < front_least else limited
                 to_stop = (w + by_torque * f2 + across * (f1 - front_braking)) / by_torque
-                braking = min(max(to_stop, rear_least), rear_most)
+                limited = rear_most if to_stop > rear_most else to_stop
+                braking = rear_least if limited < rear_least else limited
                 if v > FREELY:
                     break
             f1 -= front_braking

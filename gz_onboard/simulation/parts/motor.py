@@ -56,22 +56,16 @@ class EffectMotor:
     ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
-        self._losses, self._settled = Losses(effects, dt), [effect.term for effect in effects]
+        self._losses, self._settled = Losses(effects, dt), stepper(effects, None)
         self._q = quantities
 
     def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
-        """See `Motor`; `dt` is that of the effects."""
-        q = self._q
-        q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
-        q["torque"] = self.torque_constant * current
-        return self._losses.total(q, ledger)
+        """See `Motor`; the quantities are already up to date."""
+        return self._losses.total(self._q, ledger)
 
     def idle(self, speed: float, temperature: float) -> float:
         """See `Motor`; not a step for an effect with memory."""
         q = self._q
         q["motor_speed"], q["motor_temperature"] = speed, temperature
         q["motor_current"] = q["torque"] = 0.0
-        total = 0.0
-        for term in self._settled:
-            total += term(q)
-        return total
+        return sum(self._settled(q))
