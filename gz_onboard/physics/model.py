@@ -112,9 +112,9 @@ Recall = Callable[[Bound, Mapping[str, Any]], Any]
 """The value of an effect with memory at these quantities."""
 
 
-def over(dt: Any, before: bool = False) -> Recall:
+def over(dt: Any) -> Recall:
     """For arrays over consecutive steps of `dt` [s], starting from 0: see `Bound.series`."""
-    return lambda effect, quantities: effect.series(dt, quantities, before)
+    return lambda effect, quantities: effect.series(dt, quantities)
 
 
 def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
