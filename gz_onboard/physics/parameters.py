@@ -421,19 +421,14 @@ def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset
 
 
 def _is_positive(rows: Sequence[Sequence[float]]) -> bool:
-    """Whether a symmetric matrix with ones on its diagonal has no negative variance, except by rounding (Cholesky)."""
-    factor: list[list[float]] = []
-    for i, row in enumerate(rows):
-        mine: list[float] = []
-        for j in range(i):
-            rest = row[j] - sum(a * b for a, b in zip(mine, factor[j], strict=False))
-            if factor[j][j] < 1e-3:  # the parameter follows from those before it: what is left must be rounding
-                if abs(rest) > 1e-2:
-                    return False
-                rest = 0.0
-            mine.append(rest / (factor[j][j] or 1.0))
-        left = 1.0 - sum(a * a for a in mine)
-        if left < -1e-4:
+    """Whether a symmetric matrix has no negative variance, except by rounding: all pivots of Gaussian elimination."""
+    while rows:
+        (pivot, *row), *others = rows
+        follows = pivot < 1e-6  # the parameter follows from those before it: its remainder must be rounding
+        if pivot < -1e-4 or (follows and any(abs(x) > 1e-2 for x in row)):
             return False
-        factor.append([*mine, max(left, 0.0) ** 0.5])
+        rows = [
+            [x - (0.0 if follows else a * b / pivot) for x, b in zip(other[1:], row, strict=True)]
+            for a, other in zip(row, others, strict=True)
+        ]
     return True
