@@ -60,8 +60,11 @@ class EffectMotor:
         self._q = quantities
 
     def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
-        """See `Motor`; the quantities are already up to date."""
-        return self._losses.total(self._q, ledger)
+        """See `Motor`; `dt` is that of the effects."""
+        q = self._q
+        q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
+        q["torque"] = self.torque_constant * current
+        return self._losses.total(q, ledger)
 
     def idle(self, speed: float, temperature: float) -> float:
         """See `Motor`; not a step for an effect with memory."""
