@@ -385,6 +385,14 @@ def test_hills_wind_and_a_tilted_accelerometer_are_no_faults(dt: float):
         assert hills(1500.0, {}, roles, power=False, dt=dt).faulty == NO_SENSOR
 
 
+@pytest.mark.parametrize("mounted", [-0.04, 0.02, 0.04])
+def test_the_mounting_of_the_accelerometer_is_learned(monkeypatch: pytest.MonkeyPatch, mounted: float):
+    monkeypatch.setattr("tests.estimator.test_plausibility.MOUNTED", mounted)
+    grades = hills(1500.0, {})
+    assert grades.faulty == NO_SENSOR
+    assert grades.offset == pytest.approx(-mounted, abs=0.008)
+
+
 GRADE_FAULTS: dict[str, tuple[str, Fault]] = {
     "climbs for ever": ("gps_altitude", lambda t, v: v + 1.0 * t),
     "climbs slowly": ("gps_altitude", lambda t, v: v + 0.3 * t),

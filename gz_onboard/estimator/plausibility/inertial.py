@@ -88,7 +88,7 @@ class GradeDifference:
     @property
     def residual(self) -> float:
         """The same over its sd, which is larger over a short distance and before the usual one is known."""
-        unknown = CONFIG.usual_most * max(1 - (self._usual.seen - CONFIG.usual_prior_m) / CONFIG.grade_m, 0.0)
+        unknown = CONFIG.usual_most * max(1 - (self._usual.seen - CONFIG.usual_prior_m) / CONFIG.usual_known_m, 0.0)
         short = CONFIG.grade_m / max(min(self._difference.seen, CONFIG.grade_m), 1.0)
         return abs(self.unusual) / hypot(self._sd * sqrt(short), unknown)
 

@@ -92,9 +92,10 @@ class PlausibilityConfig:
     hardest_m_s2: float = 10.0  # no wheel grips more
     grade_m: float = 1000.0  # length of the comparison
     usual_m: float = 5000.0  # over which the mounting angle and the model's usual error are learned
-    usual_prior_m: float = 500.0  # weight of the expectation that there is none
+    usual_known_m: float = 1500.0  # after which a larger mounting angle is no longer expected
+    usual_prior_m: float = 350.0  # weight of the expectation that there is none
     usual_most: float = 0.05  # three degrees of mounting
-    grade_sd: float = 0.018  # accelerometer against altitude; 0.010 at most on the commissioning rides
+    grade_sd: float = 0.016  # accelerometer against altitude; 0.010 at most on the commissioning rides
     energy_sd: float = 0.06  # against the energy, most of it wind
     energy_decides_sd: float = 0.01  # wind is common to both comparisons with the energy
     steepest: float = 0.3
