@@ -29,9 +29,8 @@ from hypothesis import strategies as st
 
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logs import read_frames, read_samples
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import Limits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary
 from gz_onboard.daemon.loop import Daemon, fair_share
@@ -706,7 +705,7 @@ def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, mo
         monkeypatch.setattr(os, "fdatasync", lambda descriptor: late(0, descriptor))
         monkeypatch.setattr(os, "fsync", lambda descriptor: late(1, descriptor))
         begin = len(scene.heard)
-        scene.ride(20.0, lambda: log._left_out > 500)
+        scene.ride(20.0, lambda: log.lost_frames > 500)
         during = scene.heard[begin:]
         assert scene.reasons() & Reason.LOG_FAILED
         answer.set()

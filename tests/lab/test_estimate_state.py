@@ -19,8 +19,8 @@ import pytest
 import gz_onboard as gz
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.recorder import is_complete
 from gz_onboard.bus.writers import write_blf
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
