@@ -99,9 +99,11 @@ class Table:
                 there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
                 raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
 
-    def table(self, key: str) -> Table:
-        """The sub-table `key`; an empty one if it is not there."""
+    def table(self, key: str, short: str = "") -> Table:
+        """The sub-table `key`; an empty one if it is not there. short: ``key = value`` means ``{ short = value }``."""
         value = self.values.get(key, {})
+        if short and not isinstance(value, Mapping):
+            value = {short: value}
         if not isinstance(value, Mapping):
             raise self.error(f"must be a table, is {shown(value)}", key)
         return Table(value, self.file, self._text, f"{self.name}.{key}" if self.name else key)

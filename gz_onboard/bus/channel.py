@@ -1,8 +1,8 @@
-"""A CAN channel: python-can's bus, drained once for each tick instead of waking for each frame.
+"""A CAN channel: python-can's bus, drained once a tick instead of waking for each frame.
 
-On SocketCAN the bus's own socket is read with the kernel's filters, time stamps and drop counter. What the kernel
-buffers between two ticks costs one wake-up, not hundreds: a fifth of the time of python-can's reader thread.
-A bus that goes down is closed and opened again until it is back; nothing here raises for it.
+On SocketCAN the bus's own socket is read with the kernel's filters, time stamps and drop counter: one wake-up for all
+frames of a tick takes a fifth of the time of python-can's reader thread. A bus that goes down is closed, and opened
+again once it is back; nothing here raises for it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,8 @@ BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 fr
 MOST, READ_S = 5000, 0.08
 """Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
 RETRY = 1.0  # s between attempts to open a bus that is down
-ECHOING = (MULTICAST,)  # interfaces that give what is sent back to the sender
-ECHO_S = 2.0  # so long after it was sent
+MOST_ECHOES = 200  # frames that a bus may still give back to us, their sender
 _FRAME = struct.Struct("=IB3x8s")
-_FD_FRAME = struct.Struct("=IBB2x64s")
 _TIMESPEC = struct.Struct("=qq")
 _COUNT = struct.Struct("=I")
 _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
@@ -54,10 +52,8 @@ class CanChannel:
         self._identifiers = identifiers
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
-        self._echoing = interface in ECHOING or bool(options.get("receive_own_messages"))
-        self._sent: deque[tuple[float, int, bytes]] = deque(
-            maxlen=1000
-        )  # time [s], identifier, data: that may come back
+        self._echoes = interface == MULTICAST or bool(options.get("receive_own_messages"))
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=MOST_ECHOES)  # identifier, data: that will come back
         self._bus: Any = None
         self._socket: socket.socket | None = None
         self._kernel_count = 0
@@ -121,16 +117,15 @@ class CanChannel:
     def drain(self) -> list[Frame]:
         """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""
         self.behind = False
-        if not self.up and not self.reopen():
-            return []
         frames: list[Frame] = []
-        try:
-            if self._socket is not None:
-                self._drain_socket(self._socket, frames)
-            else:
-                self._drain_bus(frames)
-        except (OSError, can.CanError):  # ENETDOWN, ENODEV: what was read before is still good
-            self._close()
+        if self.up or self.reopen():
+            try:
+                if self._socket is not None:
+                    self._drain_socket(self._socket, frames)
+                else:
+                    self._drain_bus(frames)
+            except (OSError, can.CanError):  # ENETDOWN, ENODEV: the frames read before are still good
+                self._close()
         return frames
 
     def _drain_socket(self, source: socket.socket, frames: list[Frame]) -> None:
@@ -140,7 +135,7 @@ class CanChannel:
         until = now() + READ_S
         for number in range(MOST):
             try:
-                data, ancillary, _, _ = receive(72, _ANCILLARY, flags)
+                data, ancillary, _, _ = receive(_FRAME.size, _ANCILLARY, flags)
             except BlockingIOError:
                 return
             time_ns = 0
@@ -152,13 +147,8 @@ class CanChannel:
                     count = _COUNT.unpack(value)[0]
                     self.overflow += (count - self._kernel_count) & 0xFFFFFFFF
                     self._kernel_count = count
-            if len(data) == 16:
-                identifier, length, payload = unpack(data)
-            else:
-                identifier, length, _, payload = _FD_FRAME.unpack(data)
-            if length < len(payload):
-                payload = payload[:length]
-            frames.append((time_ns or time.time_ns(), identifier, payload, index))
+            identifier, length, payload = unpack(data)
+            frames.append((time_ns or time.time_ns(), identifier, payload[:length], index))
             if not number & 31 and now() > until:
                 break
         self.behind = True
@@ -175,22 +165,12 @@ class CanChannel:
             if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
                 continue
             data = bytes(message.data)
-            if self._sent and self._is_echo(identifier, data):
+            if (identifier, data) in self._sent:
+                self._sent.remove((identifier, data))
                 continue
             # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
             frames.append((time.time_ns(), identifier, data, self.index))
         self.behind = True
-
-    def _is_echo(self, identifier: int, data: bytes) -> bool:
-        """Whether that is a frame of our own, which comes back once."""
-        now = time.monotonic()
-        while self._sent and now - self._sent[0][0] > ECHO_S:
-            self._sent.popleft()
-        for sent in self._sent:
-            if sent[1:] == (identifier, data):
-                self._sent.remove(sent)
-                return True
-        return False
 
     def send(self, frame: Frame) -> bool:
         """Send `frame`; False if the bus does not take it now."""
@@ -203,8 +183,8 @@ class CanChannel:
             else:
                 extended = bool(identifier & EFF_FLAG)
                 self._bus.send(can.Message(arbitration_id=identifier & 0x1FFFFFFF, data=data, is_extended_id=extended))
-                if self._echoing:
-                    self._sent.append((time.monotonic(), identifier, data))
+                if self._echoes:
+                    self._sent.append((identifier, data))
             return True
         except (OSError, can.CanError) as error:
             self.send_failures += 1

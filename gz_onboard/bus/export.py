@@ -9,10 +9,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus import logs, tables
+from gz_onboard.bus import logs
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.signals import Decoder
-from gz_onboard.bus.writers import write_blf, write_candump
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
 
@@ -64,13 +63,7 @@ def whole(out: Path, suffix: str) -> Iterator[Path]:
 
 
 def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
-    """Write the frames to `out` in the format of `suffix`; gives how many it were."""
-    if suffix == ".log":
-        with tables.open_text(out) as text:
-            return write_candump(text, batches)
-    if suffix == ".blf":
-        with out.open("wb") as binary:
-            return write_blf(binary, batches)
+    """Write the frames to `out` by python-can, in the format of `suffix`; returns their number."""
     from gz_onboard.bus._can import can
     from gz_onboard.bus.readers.pycan import message_of, with_asammdf
 
