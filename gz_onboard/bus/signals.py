@@ -53,7 +53,6 @@ class Decoder:
         ]
         self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
         self._signals = {m.name: MessageSignals(m, mapping.not_available) for m in mapping.database.messages}
-        self._own: set[tuple[int, int]] = set()  # channel and identifier of what is taken
         self._whole: list[tuple[str, Values]] = []  # answers, of the frame that completed them
         self._answers = {
             response: Answers(those, [self._taker(request.message) for request in those], self._dropped)
@@ -80,15 +79,11 @@ class Decoder:
                     yield time_ns, message.name, self._row(message, values)
 
     def _takes(self, message: Message, channel: int, identifier: int, data: bytes) -> bool:
-        place, origins = (channel, identifier), self.origins
-        if place not in self._own:
-            self._own.clear()  # another may have had the message
-            if not origins.claim(message, channel, identifier):
-                origins.differs(message, channel, identifier, data)
-                return False
-            self._own.add(place)
-        if message.name in origins.recent:
-            origins.own(message.name, data)
+        if not self.origins.claim(message, channel, identifier):
+            self.origins.differs(message, channel, identifier, data)
+            return False
+        if message.name in self.origins.recent:
+            self.origins.own(message.name, data)
         return True
 
     def _row(self, message: Message, values: Values) -> Values:
