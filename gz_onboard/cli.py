@@ -105,7 +105,7 @@ class _Parser(argparse.ArgumentParser):
         """Where a file or folder `word` goes on the command line of this command."""
         if any(not action.option_strings for action in self._actions):
             return "; files go before the options"
-        named = ((str(action.metavar), action) for action in self._actions if action.help != argparse.SUPPRESS)
+        named = ((str(action.metavar), action) for action in self._actions)
         taking = [f"{action.option_strings[0]} {of}" for of, action in named if re.search("FILE|TOML|DIR", of)]
         replayed = Path(word).is_dir() or word.lower().removesuffix(".gz").endswith(LOG_SUFFIXES)
         ride = "; a recorded ride is for estimate, or for replay onto a bus" if replayed else ""
@@ -113,10 +113,10 @@ class _Parser(argparse.ArgumentParser):
         return f"; {name} takes files and folders behind its options only: {', '.join(taking)}{ride}"
 
     def known_options(self) -> list[str]:
-        """The options of this command and of its subcommands, without their old names."""
+        """The options of this command and of its subcommands."""
         options: list[str] = []
         for action in self._actions:
-            options += action.option_strings if action.help != argparse.SUPPRESS else []
+            options += action.option_strings
             if isinstance(action, argparse._SubParsersAction):
                 for parser in action.choices.values():
                     options += parser.known_options()

@@ -69,7 +69,7 @@ class CanChannel:
         except (OSError, can.CanError) as error:
             if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:
                 raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error
-            self._close()  # not there yet: a bus may come up later
+            self.close()  # not there yet: a bus may come up later
 
     def _open(self) -> None:
         filters: list[dict[str, Any]] | None = None
@@ -96,7 +96,8 @@ class CanChannel:
             self._kernel_count = 0
         self.up = True
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close; the next `drain` after a while opens it again."""
         self.up = False
         self._socket = None
         self._retry_at = time.monotonic() + RETRY
@@ -111,7 +112,7 @@ class CanChannel:
             try:
                 self._open()
             except (OSError, can.CanError, ValueError):
-                self._close()
+                self.close()
         return self.up
 
     def drain(self) -> list[Frame]:
@@ -125,31 +126,28 @@ class CanChannel:
                 else:
                     self._drain_bus(frames)
             except (OSError, can.CanError):  # ENETDOWN, ENODEV: the frames read before are still good
-                self._close()
+                self.close()
         return frames
 
     def _drain_socket(self, source: socket.socket, frames: list[Frame]) -> None:
-        receive, index, now = source.recvmsg, self.index, time.monotonic
-        flags = socket.MSG_DONTWAIT
-        unpack, unpack_time = _FRAME.unpack, _TIMESPEC.unpack
-        until = now() + READ_S
+        until = time.monotonic() + READ_S
         for number in range(MOST):
             try:
-                data, ancillary, _, _ = receive(_FRAME.size, _ANCILLARY, flags)
+                data, ancillary, _, _ = source.recvmsg(_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return
             time_ns = 0
             for _level, kind, value in ancillary:
                 if kind == SO_TIMESTAMPNS:
-                    seconds, nanoseconds = unpack_time(value)
+                    seconds, nanoseconds = _TIMESPEC.unpack(value)
                     time_ns = seconds * 1_000_000_000 + nanoseconds
                 elif kind == SO_RXQ_OVFL:
                     count = _COUNT.unpack(value)[0]
                     self.overflow += (count - self._kernel_count) & 0xFFFFFFFF
                     self._kernel_count = count
-            identifier, length, payload = unpack(data)
-            frames.append((time_ns or time.time_ns(), identifier, payload[:length], index))
-            if not number & 31 and now() > until:
+            identifier, length, payload = _FRAME.unpack(data)
+            frames.append((time_ns or time.time_ns(), identifier, payload[:length], self.index))
+            if not number & 31 and time.monotonic() > until:
                 break
         self.behind = True
 
@@ -190,9 +188,5 @@ class CanChannel:
             self.send_failures += 1
             code = getattr(error, "errno", None) or getattr(error, "error_code", None)
             if code not in (errno.ENOBUFS, errno.EAGAIN, None):
-                self._close()
+                self.close()
             return False
-
-    def close(self) -> None:
-        """Close for good."""
-        self._close()

@@ -1,4 +1,4 @@
-"""DBC files: where they are, and one cantools database out of several."""
+"""Find DBC files, and read several into one cantools database."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def find_dbc(name: str, beside: Path | None = None) -> Path:
-    """The DBC file `name`: a path, or one beside the vehicle file, or one of the project's own."""
+    """The path of the DBC file `name`: in the folder `beside`, or one that comes with this package."""
     places = [_PACKAGE / "dbc", _PACKAGE.parent / "dbc"]
     if beside:
         places.insert(0, beside)
@@ -110,7 +110,7 @@ class _DbcFile:
         self._said: dict[str, None] = {}  # each problem once, with its line
 
     def messages(self) -> list[Message]:
-        """The messages without what was left out, of which a warning tells."""
+        """The usable messages. A warning lists the parts that were left out."""
         if problem := _impossible_size(self._text):
             raise self.invalid(problem)
         messages = [self._without_bad_signals(message) for message in self._parsed().messages]
@@ -182,7 +182,7 @@ class _DbcFile:
         return True
 
     def _without_bad_signals(self, message: Message) -> Message:
-        """Take from `message` the signals that overlap, do not fit or are no numbers."""
+        """Take from `message` the signals that overlap, do not fit or are not finite numbers."""
         period = message.cycle_time
         if period and not (isinstance(period, int | float) and 0.1 <= period <= 3.6e6):
             problem = f"the cycle time is {shown(period)} ms, outside 0.1 to 3600000,"
@@ -200,7 +200,7 @@ class _DbcFile:
                     raise self.invalid(str(error)) from error
 
     def _drop(self, message: Message, names: Collection[str | None], problem: str) -> bool:
-        """Take the signals of these names from `message`; False if it has none of them."""
+        """Take the signals of these names from `message`; False if there are no such signals."""
         dropped = [signal for signal in message.signals if signal.name in names]
         for signal in dropped:
             message.signals.remove(signal)

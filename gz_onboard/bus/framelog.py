@@ -1,4 +1,4 @@
-"""Raw CAN frames in blocks: the binary form in which the log holds them, layout in docs/log-format.md.
+"""Encode raw CAN frames as the binary blocks of our log (layout: docs/log-format.md).
 
 Within a block the data bytes stand by kind of frame (same identifier, channel and length) and there by byte
 position, because a byte resembles the same byte of the frame before it far more than its neighbour: the same

@@ -45,7 +45,7 @@ _NUMBERED = re.compile(rb"\b(BO_|SG_|VAL_|BO_TX_BU_|SIG_GROUP_|SIG_VALTYPE_) (\d
 
 @dataclass(frozen=True)
 class Counts:
-    """What the daemon counted since its start."""
+    """Frames that the daemon counted since its start."""
 
     dropped: int = 0
     implausible: int = 0
@@ -82,7 +82,7 @@ class Publisher:
         return {self._encoders[name].identifier: message for name, message in self.messages.items()}
 
     def may_have_sent(self, frame: Frame) -> bool:
-        """Whether `frame` is like ours, in identifier and checksum: an earlier run's, if it stands in a log."""
+        """Whether `frame` is like ours, in identifier and checksum: if it is in a log, an earlier run sent it."""
         _, identifier, data, _ = frame
         return identifier in self.identifiers and len(data) == LENGTH and crc8_sae_j1850(data[:-1]) == data[-1]
 
@@ -192,7 +192,7 @@ def reason_signal(reason: Reason) -> str:
 
 
 def _why(why: Explanation | None) -> dict[str, float | None]:
-    """The rated range and the two largest causes; none for what is not known."""
+    """The rated range and the two largest causes; unknown ones are None."""
     nothing: tuple[Cause, float | None] = Cause.NONE, None
     values: dict[str, float | None] = {"RANGE_WhyRated": why.reference * 1e-3 if why else None}
     for i, (cause, size) in enumerate([*(why.largest() if why else ()), nothing, nothing][:2], 1):
@@ -210,67 +210,59 @@ def _scaled(value: float | None, factor: float) -> float | None:
 def range_messages(file: Path) -> dict[str, Message]:
     """The messages of our own frames in a DBC file, by name; there may be others in it.
 
-    InputError for what is missing that ``dbc/range.dbc`` has, and for what cannot be sent.
+    InputError for a message or signal of ``dbc/range.dbc`` that is missing or cannot be sent.
     """
     own = find_dbc(RANGE_DBC)
     standard = load_database([own])
-    database = standard if file == own else load_database([file])
-    found = {message.name: message for message in database.messages}
+    found = {message.name: message for message in (standard if file == own else load_database([file])).messages}
     for wanted in standard.messages:
-        message = found.get(wanted.name)
-        if message is None:
-            raise InputError(
-                f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{nearest(wanted.name, found)}"
-            )
-        if problem := _unfit(message, wanted):
+        if wanted.name not in found:
+            near = nearest(wanted.name, found)
+            raise InputError(f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{near}")
+        if problem := _message_problem(found[wanted.name], wanted):
             raise InputError(f"{file}: message {wanted.name}: {problem}")
     return {wanted.name: found[wanted.name] for wanted in standard.messages}
 
 
-def _unfit(message: Message, wanted: Message) -> str:
-    """What is wrong with `message`, which shall carry what `wanted` of ``dbc/range.dbc`` does; else nothing."""
+def _message_problem(message: Message, wanted: Message) -> str:
+    """Why `message` cannot carry the signals of `wanted`, a message of ``dbc/range.dbc``; empty if it can."""
     if message.length != 8 or message.is_fd:
         return f"must have 8 bytes in a classic frame, has {message.length}{' in a CAN FD frame' * message.is_fd}"
     signals = {signal.name: signal for signal in message.signals}
     if len({signal.byte_order for signal in message.signals}) > 1:
         return "its signals must all have the same byte order"
     for model in wanted.signals:
-        signal = signals.get(model.name)
-        if signal is None:
+        if model.name not in signals:
             return f"has no signal {model.name}{nearest(model.name, signals)}"
-        if problem := _unfit_signal(signal, model):
-            return f"signal {signal.name} {problem}"
+        if problem := _signal_problem(signals[model.name], model):
+            return f"signal {model.name} {problem}"
     return ""
 
 
-def _unfit_signal(signal: Signal, model: Signal) -> str:
+def _signal_problem(signal: Signal, model: Signal) -> str:
     if signal.conversion.is_float or signal.is_multiplexer or signal.multiplexer_ids is not None:
         return "must be an integer that is in every frame (not floating point, not multiplexed)"
     if model.name.endswith("CRC"):
         return "" if (signal.length, first_bit(signal)) == (8, 56) else "must be the last byte, all 8 bits of it"
     if first_bit(signal) + signal.length > 56:
         return "stands in the last byte, which is the checksum's"
+    unit = model.unit or ""
     if model.length >= 8:  # a quantity, with a code for not available
-        if (signal.unit or "") != (model.unit or ""):
-            return (
-                f"has unit {signal.unit or ''!r}, must have {model.unit or ''!r}; only its scale and place may differ"
-            )
+        if (signal.unit or "") != unit:
+            return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
         if signal.length < 8:
             return f"needs 8 bits or more for the code 'not available', has {signal.length}"
-        needed = (0, 100) if model.name == SOC else (0,)
-        field = _field(signal)
-        missing = [value for value in needed if field.raw(value) is None]
-        return f"must be able to say {missing[0]} {model.unit or ''}".rstrip() if missing else ""
+        missing = [value for value in (0, 100 if model.name == SOC else 0) if _field(signal).raw(value) is None]
+        return f"must be able to say {missing[0]} {unit}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
-    if (signal.conversion.scale, signal.conversion.offset, low) != (1, 0, 0) or high < most:
-        return f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
-    return ""
+    is_whole = (signal.conversion.scale, signal.conversion.offset, low) == (1, 0, 0) and high >= most
+    return "" if is_whole else f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
 
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """Where a signal stands in its message, an integer of the first seven bytes, and its raw values."""
+    """The place of a signal in its message, an integer of the first seven bytes, and its raw values."""
 
     shift: int
     mask: int

@@ -39,7 +39,7 @@ _PROGRESS_NS = 500_000_000
 
 @dataclass
 class Sent:
-    """What was sent: numbers of frames, time it took [s], and how late the latest frame was [s]."""
+    """Numbers of frames, duration [s] and largest delay of a frame [s] of a replay."""
 
     sent: int = 0
     failed: int = 0
@@ -198,7 +198,7 @@ def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | 
 def _sendable(
     batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Sent
 ) -> Iterable[list[Frame]]:
-    """Without error frames, which no host can send, and what is not for the channels at hand."""
+    """Leave out error frames, which no host can send, and frames of channels beyond those of the bus."""
     for batch in batches:
         kept = [
             frame

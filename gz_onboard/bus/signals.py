@@ -1,4 +1,4 @@
-"""All signals of recorded frames, in the units of the DBC, for tables and for an MCAP of signals."""
+"""Decode all signals of recorded frames, in the units of the DBC, for tables and for an MCAP of signals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Decoded = tuple[int, str, Values]
 
 
 class MessageSignals:
-    """All signals of one message. not_available: whether all ones stand for it."""
+    """Decodes all signals of one message. not_available: whether all ones mean that."""
 
     def __init__(self, message: Message, not_available: bool = True) -> None:
         self.message = message
@@ -42,7 +42,7 @@ class MessageSignals:
 
 
 class Decoder:
-    """All signals of the frames of one bus, and of answers; what cannot be decoded is counted, never guessed."""
+    """Decodes all signals of the frames of one bus, and of answers; counts the frames that it cannot decode."""
 
     def __init__(self, mapping: BusMapping) -> None:
         self.unknown = self.undecodable = self.copies = 0
