@@ -37,7 +37,7 @@ class Request:
 
     request: int  # identifier with its flag
     response: int
-    addresses: tuple[int, int] | None  # the first byte of the frames of request and response, if they have one
+    addresses: tuple[int, ...] | None  # the first byte of the frames of request and response, if they have one
     prefix: bytes  # of a positive answer: service and data identifier
     period: float  # s
     message: Message  # of the bytes behind the data identifier
@@ -80,11 +80,8 @@ def _request(table: Table) -> Request:
     size = IDENTIFIER_BYTES[service]
     data_identifier = table.integer("data_identifier", 0, 256**size - 1)
     request, response = (table.integer(key, 0, MOST_EXTENDED) for key in _IDENTIFIERS)
-    if request == response:
-        raise table.error("is that of the request too", "response_identifier")
-    addresses = None
-    if any(key in table.values for key in _ADDRESSES):
-        addresses = table.integer(_ADDRESSES[0], 0, 255), table.integer(_ADDRESSES[1], 0, 255)
+    has_addresses = any(key in table.values for key in _ADDRESSES)
+    addresses = tuple(table.integer(key, 0, 255) for key in _ADDRESSES) if has_addresses else None
     return Request(
         request | EFF_FLAG if request > MOST_STANDARD else request,
         response | EFF_FLAG if response > MOST_STANDARD else response,
