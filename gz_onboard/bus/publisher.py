@@ -71,6 +71,7 @@ class Publisher:
         self._reason_bits = [(int(reason), 1 << self._fields[reason_signal(reason)].shift) for reason in Reason]
         signals = [(role, self._fields.get(sensor_signal(role))) for role in ROLES]
         self._sensor_bits = [(role, 1 << field.shift) for role, field in signals if field]
+        self._packed: tuple[Estimate | None, int] = None, 0  # the last status
 
     @cached_property
     def identifiers(self) -> frozenset[int]:
@@ -133,26 +134,27 @@ class Publisher:
             },
         }
         distrusted = sum(bit for role, bit in self._sensor_bits if role in e.distrusted)
-        return [
-            self._encoders[name].frame(values, time_ns, distrusted if name == "RANGE_Sensors" else 0)
-            for name, values in frames.items()
-        ]
+        out = []
+        for name, values in frames.items():
+            encoder = self._encoders[name]
+            out.append(encoder.frame(encoder.pack(values, distrusted if name == "RANGE_Sensors" else 0), time_ns))
+        return out
 
     def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
-        """The frame of every tenth of a second."""
+        """The frame of every tenth of a second. `estimate` may not be changed afterwards: it is packed once."""
+        if estimate is not self._packed[0]:
+            self._packed = estimate, self._pack_status(estimate)
+        return [self._encoders["RANGE_Status"].frame(self._packed[1], time_ns)]
+
+    def _pack_status(self, estimate: Estimate) -> int:
         state = self.reported(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
         if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
             soc = sigma = None  # neither is of use without the other
-        values: dict[str, float | None] = {
-            SOC: soc,
-            SIGMA: sigma,
-            "RANGE_StatusState": state,
-            "RANGE_Activity": estimate.activity,
-        }
+        values = {SOC: soc, SIGMA: sigma, "RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
         reasons = int(estimate.reasons)
         bits = sum(bit for reason, bit in self._reason_bits if reasons & reason)
-        return [self._encoders["RANGE_Status"].frame(values, time_ns, bits)]
+        return self._encoders["RANGE_Status"].pack(values, bits)
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
@@ -297,13 +299,17 @@ class _Encoder:
     counts: int
     counter: int = 0  # of the next frame, below `counts`
 
-    def frame(self, values: Mapping[str, float | None], time_ns: int, flags: int = 0) -> Frame:
-        """The next frame. flags: the bits of the fields that `values` leaves out."""
-        word = self.blank | flags | self.counter << self.counter_shift
-        self.counter = (self.counter + 1) % self.counts
+    def pack(self, values: Mapping[str, float | None], flags: int = 0) -> int:
+        """The signals at their places, without counter. flags: the bits of the fields that `values` leaves out."""
+        word = self.blank | flags
         for name, value in values.items():
             word |= self.fields[name].bits(value)
-        data = word.to_bytes(7, self.order)
+        return word
+
+    def frame(self, word: int, time_ns: int) -> Frame:
+        """The next frame, of a word from `pack`."""
+        data = (word | self.counter << self.counter_shift).to_bytes(7, self.order)
+        self.counter = (self.counter + 1) % self.counts
         return time_ns, self.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
 
 
