@@ -33,8 +33,8 @@ _SIGNAL_SIZE = re.compile(r"^[ \t]*SG_[ \t]+(\w+)[^:\n\"]*:[ \t]*(\d+)[ \t]*\|[ 
 _MESSAGE_NAME = re.compile(r"\s*BO_\s+\d+\s+(\w+)")
 _SIGNAL_NAME = re.compile(r"\s*SG_\s+([^\s:]+)")
 _DECIDES_OTHERS = re.compile(r"\s*(SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_)")  # without it another signal is read otherwise
-MOST_BROKEN = 20  # lines: what has more is another kind of file
-MOST_SAID = 5  # of what is left out
+MOST_BROKEN = 20  # lines: a file with more is not DBC
+MOST_SAID = 5  # problems in one warning
 
 _LOG = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -141,19 +141,18 @@ class _DbcFile:
 
     def _parsed(self) -> Database:
         """The file as cantools reads it, without the lines that it refuses."""
-        refused = None
-        for _ in range(MOST_BROKEN + 1):
+        problems: list[str] = []
+        while True:
             database = empty_database(strict=False)
             try:
                 database.add_dbc_string(self._text + _END)
                 return database
             except Exception as error:  # cantools and textparser raise a dozen types
-                kind = type(error).__name__
-                problem = f"cantools cannot read it ({kind}: {error})" if isinstance(error, LookupError) else str(error)
-                refused = refused or self.invalid(problem or kind)
-                if self._left_out is None or not self._mend(problem):
-                    raise refused from error
-        raise refused or self.invalid("too many lines are no DBC")
+                kind, said = type(error).__name__, str(error)
+                unforeseen = isinstance(error, LookupError)  # by cantools, which has not met such a file
+                problems.append(f"cantools cannot read it ({kind}: {said})" if unforeseen else said or kind)
+                if self._left_out is None or len(problems) > MOST_BROKEN or not self._mend(problems[-1]):
+                    raise self.invalid(problems[0]) from error
 
     def _mend(self, problem: str) -> bool:
         """Leave out the lines that cantools' `problem` names; False if they are not known."""
@@ -163,8 +162,8 @@ class _DbcFile:
         unused = re.findall(r"^\s*(VAL_ \d+ \w+)$", problem, re.M)
         for start in unused:
             pattern = re.compile(rf"\s*{start.replace(' ', ' +')}\b")
-            at = next(i for i, line in enumerate(self._lines) if pattern.match(line))
-            self._leave_out(at, f"there is no signal for {start}")
+            for at in [i for i, line in enumerate(self._lines) if pattern.match(line)]:
+                self._leave_out(at, f"there is no signal for {start}")
         return bool(unused)
 
     def _leave_out(self, at: int, problem: str) -> bool:
