@@ -83,7 +83,7 @@ Take = Callable[[float, bytes], object]
 """Takes the time [s] and the bytes behind the data identifier."""
 
 
-class Answers:
+class AnswerReader:
     """Gives each answer on one identifier to the one of `takers` at the place of its request in `requests`.
 
     fault: counts (message, reason).

@@ -29,7 +29,7 @@ _LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with th
 
 
 @dataclass(frozen=True)
-class Limits:
+class LogLimits:
     """How often a `Recorder` syncs, when it closes a file, how much it keeps, how long it waits after an error.
 
     InputError if one file may be larger than all files together.
@@ -49,7 +49,7 @@ class Limits:
             )
 
 
-LIMITS = Limits()
+LIMITS = LogLimits()
 
 
 class Recorder:
@@ -68,7 +68,7 @@ class Recorder:
         vehicle: str,
         metadata: Mapping[str, str] | None = None,
         attachments: Mapping[str, bytes] | None = None,
-        limits: Limits = LIMITS,
+        limits: LogLimits = LIMITS,
     ) -> None:
         self.paths: list[Path] = []
         self.errors = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.answers import NEGATIVE, Answers, Take, by_response
+from gz_onboard.bus.answers import NEGATIVE, AnswerReader, Take, by_response
 from gz_onboard.bus.layout import raw_range, raw_values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
@@ -55,7 +55,7 @@ class Decoder:
         self._signals = {m.name: MessageSignals(m, mapping.not_available) for m in mapping.database.messages}
         self._whole: list[tuple[str, Values]] = []  # answers, of the frame that completed them
         self._answers = {
-            response: Answers(those, [self._taker(request.message) for request in those], self._dropped)
+            response: AnswerReader(those, [self._taker(request.message) for request in those], self._dropped)
             for response, those in by_response(mapping.requests).items()
         }
         self._asked = {request.request for request in mapping.requests}

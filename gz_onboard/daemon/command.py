@@ -17,7 +17,7 @@ from pathlib import Path
 
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.constants import HOUR
 from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import state_file
@@ -130,7 +130,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
             vehicle.name,
             metadata={"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle)), **payload},
             attachments=dbc_texts(vehicle),
-            limits=Limits(
+            limits=LogLimits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),
                 max_age_s=arguments.log_file_hours * HOUR,
                 max_total_bytes=round(arguments.log_total_mb * 1e6),
