@@ -167,6 +167,8 @@ def _line_numbers(text: str) -> dict[str, int]:
                 lines.setdefault(path, number)
                 table = path = f"{path}.{counts[path]}"
                 counts[path.rpartition(".")[0]] += 1
+            elif array := next((array for array in counts if path.startswith(f"{array}.")), None):
+                table = path = f"{array}.{counts[array] - 1}{path[len(array) :]}"  # of the last table so far
         elif key := _KEY.match(line):
             path = _joined(table, _path(key[1]))
         else:
