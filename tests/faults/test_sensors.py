@@ -7,7 +7,7 @@ from math import log, sqrt
 
 import pytest
 
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from tests.faults.support import (
     BEGIN,
     END,

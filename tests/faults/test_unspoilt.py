@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from tests.faults.support import RIDE, USUAL, check_all, check_no_jump, ride, unspoilt
 from tests.support import check_sound, reasons_in, received
 
