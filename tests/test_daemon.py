@@ -277,7 +277,7 @@ def without_states(snapshot: Snapshot) -> None:
 def learned() -> Snapshot:
     """What five seconds of riding have taught, with a bias that no fresh estimator has."""
     estimator = ridden(Scooter().steady(5.0)).pipeline.estimator
-    estimator.road.bias_x = 0.01
+    estimator.motion.gyro_bias = 0.01, 0.0
     snapshot = estimator.snapshot(reference().key)
     assert snapshot is not None
     return snapshot
@@ -285,7 +285,7 @@ def learned() -> Snapshot:
 
 def is_fresh(daemon: Daemon) -> bool:
     ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
-    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours.soc.saved is None
+    return ours.snapshot("") == new.snapshot("") is None and ours.motion == new.motion and ours.soc.saved is None
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ def test_what_is_sound_of_a_damaged_state_is_gone_on_from(
     as_new = {
         "charge": ours.soc.saved is None,
         "riding": riding_of(ours) == riding_of(new),
-        "gyro bias": ours.road.bias_x == 0,
+        "gyro bias": ours.motion.gyro_bias[0] == 0,
         "capacity": ours.soc.ageing.snapshot()["capacity"] == new.soc.ageing.snapshot()["capacity"],
     }
     lost = {"learned": {"capacity"}, "weakest": set()}.get(part, {part})
@@ -407,7 +407,7 @@ def test_whatever_restoring_raises_it_begins_afresh(
     state.write(file, state.encode(learned, time.time()))
 
     def half(self: Estimator, *_: object) -> None:
-        self.road.bias_x = 7.0
+        self.motion.gyro_bias = 7.0, 0.0
         raise ZeroDivisionError("in the middle")
 
     monkeypatch.setattr(Estimator, "restore", half)

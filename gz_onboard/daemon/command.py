@@ -28,7 +28,7 @@ from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOCK_S = 3.0  # to wait for one that is ending
@@ -121,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
-    route = read_ahead(arguments.route)[1] if arguments.route else None
+    route = read_route(arguments.route) if arguments.route else None
     recorder = None
     if arguments.log_dir:
         payload = {} if arguments.payload is None else {"payload_kg": f"{arguments.payload:g}"}

@@ -21,10 +21,10 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.estimator.route_ahead import Road
+from gz_onboard.estimator.route import PreparedRoute
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.routes.columns import LEAST_ROWS, Columns
-from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
+from gz_onboard.routes.columns import MIN_ROWS, Columns
+from gz_onboard.routes.route import ROUTE_COLUMNS, Route, route_of
 
 MOST_BYTES = 8_000_000  # of a request: the most points with all columns have half of it
 SECONDS = 5.0  # for a request to come, and for its answer to be taken
@@ -42,7 +42,7 @@ class Control:
 
     def __init__(self, path: Path | None, pipeline: Callable[[], Pipeline]) -> None:
         self._path, self._pipeline = path, pipeline
-        self._ready: SimpleQueue[Road | None] = SimpleQueue()  # for the loop to take
+        self._ready: SimpleQueue[PreparedRoute | None] = SimpleQueue()  # for the loop to take
         self._name: str | None = None
         self._socket: socket.socket | None = None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
@@ -67,7 +67,7 @@ class Control:
 
     def give(self, route: Route | None) -> None:
         """Make `route` ready, which may take seconds, and have the loop take it; in any thread."""
-        road = self._pipeline().estimator.ahead.ready(route) if route else None
+        road = self._pipeline().estimator.route.prepare(route) if route else None
         self._name = route.name if route else None
         self._ready.put(road)
 
@@ -75,7 +75,7 @@ class Control:
         """In the loop: have what is ready followed from now on."""
         while not self._ready.empty():
             road = self._ready.get_nowait()
-            self._pipeline().estimator.ahead.follow(road)
+            self._pipeline().estimator.route.follow(road)
             log.info("route %s", "given" if road else "cleared")
 
     def close(self) -> None:
@@ -159,9 +159,9 @@ def route_of_request(request: object) -> Route:
     for column, numbers in request.items():
         if column == "name":
             continue
-        if column not in KNOWN_AHEAD:
-            known = ", ".join(KNOWN_AHEAD)
-            raise InputError(f"route: unknown list {shown(column)}{nearest(column, KNOWN_AHEAD)}; known are {known}")
+        if column not in ROUTE_COLUMNS:
+            known = ", ".join(ROUTE_COLUMNS)
+            raise InputError(f"route: unknown list {shown(column)}{nearest(column, ROUTE_COLUMNS)}; known are {known}")
         if not isinstance(numbers, list):
             raise InputError(f"route: {column}: must be a list of numbers, is {shown(numbers)}")
         values[column] = tuple(_number(column, point, x) for point, x in enumerate(numbers, start=1))
@@ -169,9 +169,10 @@ def route_of_request(request: object) -> Route:
     if len(set(lengths.values())) > 1:
         raise InputError(f"route: its lists must be of one length, are {shown(lengths)}")
     count = min(lengths.values(), default=0)
-    if count < LEAST_ROWS:
-        raise InputError(f"route: has {count} points, must have at least {LEAST_ROWS}")
-    return route_ahead_of(Columns(Path("route, point"), tuple(range(1, count + 1)), values), name)
+    if count < MIN_ROWS:
+        raise InputError(f"route: has {count} points, must have at least {MIN_ROWS}")
+    places = tuple(f"route, point {i + 1}" for i in range(count))
+    return route_of(Columns("route", places, values), name)
 
 
 def _number(column: str, point: int, value: object) -> float:
@@ -182,7 +183,7 @@ def _number(column: str, point: int, value: object) -> float:
             number = float("inf")
         if isfinite(number):
             return number
-    raise InputError(f"route, point:{point}: {column}: must be a finite number, is {shown(value)}")
+    raise InputError(f"route, point {point}: {column}: must be a finite number, is {shown(value)}")
 
 
 def _line(client: socket.socket) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 
-from gz_onboard.estimator.road import MOST_BIAS
+from gz_onboard.estimator.motion import MOTION
 
 BOUNDS = {
     "soc": (0.0, 1.0),
@@ -14,7 +14,7 @@ BOUNDS = {
     "odometer": (-1e3, 1e10),  # m
     "own_soc": (-0.1, 1.1),
     "consumption": (-1e5, 1e5),  # J/m
-    "gyro_bias": (-MOST_BIAS, MOST_BIAS),
+    "gyro_bias": (-MOTION.max_gyro_bias, MOTION.max_gyro_bias),
     "still": (0.0, 1e10),  # s
     "time_moving": (0.0, 1e7),  # s
     "gap": (-1e6, 1e6),  # m

@@ -23,13 +23,13 @@ from math import hypot, inf, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY, HOUR
-from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.auxiliaries import Auxiliaries
 from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.calm import Calm, restored_calm
 from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states, unlearned
 from gz_onboard.estimator.riders import Riders, restored_riders
@@ -171,10 +171,10 @@ class Forecaster:
             segment.level += to_come
         else:
             self._stand(r.second.seconds)
-            if r.still <= STOP_TIME:
+            if r.still <= MOTION.stop_time:
                 segment.standing += r.second.energy
                 segment.beside_standing += self.auxiliaries.now * r.second.seconds
-        if r.still <= STOP_TIME:
+        if r.still <= MOTION.stop_time:
             segment.duration += r.second.seconds
             segment.squares += r.second.squares
         segment.level -= stored

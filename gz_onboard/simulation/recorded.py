@@ -124,14 +124,14 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         estimator.handle(event)
         if event[0] >= tick:
             tick = event[0] + 0.1
-            road = estimator.road
-            speed = road.speed or 0.0
-            turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
-            rows.append((road.distance, road.grade or 0.0, turning))
-            if road.heading is not None and speed > _MOVING:
-                headings.append((road.distance, road.heading))
+            motion = estimator.motion
+            speed = motion.speed or 0.0
+            turning = (motion.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
+            rows.append((motion.distance, motion.grade or 0.0, turning))
+            if motion.heading is not None and speed > _MOVING:
+                headings.append((motion.distance, motion.heading))
             if reads_vibration:
-                rough.append((event[0], road.distance, estimator.vibration(event[0])))
+                rough.append((event[0], motion.distance, estimator.vibration(event[0])))
 
     columns = true_columns(read_roles(log, vehicle, (codec, frames), progress, observe), vehicle.parameters)
     felt = np.array(rough) if rough and "accel_z" in columns else None

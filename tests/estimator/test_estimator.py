@@ -230,10 +230,10 @@ def test_a_snapshot_that_does_not_fit_is_refused_whole(damage, message):
     saved = estimator.snapshot("key")
     assert saved
     fresh = Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
-    before = fresh.snapshot("key"), fresh.forecaster.snapshot(), fresh.road
+    before = fresh.snapshot("key"), fresh.forecaster.snapshot(), fresh.motion
     with pytest.raises(ValueError, match=message):
         fresh.restore({**saved, **damage}, "key", 5.0)
-    assert (fresh.snapshot("key"), fresh.forecaster.snapshot(), fresh.road) == before
+    assert (fresh.snapshot("key"), fresh.forecaster.snapshot(), fresh.motion) == before
 
 
 def test_a_pause_in_the_data_widens_and_goes_on():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.vibration import SETTLED, STUCK, VibrationMonitor
+from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.events import Group
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.vibration import Vibration
@@ -86,9 +86,9 @@ def test_slow_motion_is_no_vibration():
     ("samples", "known"),
     [
         ([], False),
-        (shaken(SETTLED - 1, 1.0), False),  # would be told too small
-        (shaken(SETTLED + 1, 1.0), True),
-        (shaken(SETTLED + 1, 1.0, step=0.03), True),
+        (shaken(MOTION.vibration_after - 1, 1.0), False),  # would be told too small
+        (shaken(MOTION.vibration_after + 1, 1.0), True),
+        (shaken(MOTION.vibration_after + 1, 1.0, step=0.03), True),
         (shaken(30, 1.0, step=0.05), False),  # too slow to show it
         ([(0.01 * i, 9.81) for i in range(3000)], False),  # stuck
         ([(0.01 * i, 9.81 + 0.1 * (i % 90 < 45)) for i in range(3000)], True),  # coarse, but alive
@@ -106,7 +106,7 @@ def test_known_or_not(samples, known):
 
 
 def test_after_a_stuck_sensor_it_begins_anew():
-    stuck = shaken(20, 3.0) + [(20 + 0.01 * i, 11.0) for i in range(round(100 * (STUCK + 1)))]
+    stuck = shaken(20, 3.0) + [(20 + 0.01 * i, 11.0) for i in range(round(100 * (MOTION.stuck_after + 1)))]
     monitor = fed(stuck)
     assert monitor.value(stuck[-1][0]) is None
     again = shaken(60, 1.0, begin=stuck[-1][0] + 0.01)
@@ -116,7 +116,7 @@ def test_after_a_stuck_sensor_it_begins_anew():
 
 @given(st.lists(st.tuples(st.floats(-0.1, 0.3), st.floats(-60, 60)), max_size=60), st.floats(0, 0.2))
 def test_whatever_comes_it_is_none_or_a_possible_number(steps, after):
-    now, monitor = 0.0, fed(shaken(SETTLED + 1, 1.0, begin=-8.0))
+    now, monitor = 0.0, fed(shaken(MOTION.vibration_after + 1, 1.0, begin=-8.0))
     for dt, z in steps:
         now += dt
         monitor.update(now, z)
