@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gz_onboard.estimator import snapshot
-from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
+from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.model_inputs import ModelInputs
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
@@ -72,7 +72,7 @@ class Estimator:
         )
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.attribution = Attribution(self.forecaster, self.signals)
+        self.explainer = RangeExplainer(self.forecaster, self.signals)
         self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
@@ -248,7 +248,7 @@ class Estimator:
         learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if forgotten := newly & learned:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
-            self.attribution.forget(forgotten)
+            self.explainer.forget(forgotten)
         if "auxiliary_current" in newly:
             self.forecaster.auxiliaries.forget()
         if newly & AGED_FROM:
@@ -314,8 +314,9 @@ class Estimator:
         soc = self.soc.ageing.state_of_charge(filter_)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activity.now))
         if self._outlook.forecast:
-            of_road = self.motion.distance, self.route.hills
-            self.attribution.take(Moment(now, self._outlook.forecast, soc[0], conditions, *of_road))
+            charging = self._activity.now is Activity.CHARGING
+            way = self.motion.distance, self.route.hills
+            self.explainer.take(now, self._outlook.forecast, soc[0], conditions, *way, charging)
 
     # --- results ----------------------------------------------------------------------------------------------
 
@@ -339,7 +340,7 @@ class Estimator:
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self._outlook.report(estimate)
-        estimate.why = self.attribution.latest if self._outlook.forecast else None
+        estimate.why = self.explainer.latest if self._outlook.forecast else None
         reasons = int(estimate.reasons)  # plain numbers: ten times a second flags take longer than all of the above
         estimate.state = State.DEGRADED if reasons & int(DEGRADING) else State.VALID
         missing = reasons | int(self._missing.lacking)

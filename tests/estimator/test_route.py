@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.attribution import Attribution, Moment
+from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
@@ -135,12 +135,12 @@ def given_on_the_way(route: Route) -> Explanation:
     """The change of the range with the route, in causes."""
     rider = Rider()
     free = rider.forecaster.forecast(0.7, 0.01, 20.0, 1.0, AIR.ambient, AIR.altitude)
-    attribution = Attribution(rider.forecaster, rider.signals)
+    explainer = RangeExplainer(rider.forecaster, rider.signals)
     for now, road in enumerate((None, rider.forecast.prepare(route))):
         rider.forecast.follow(road)
         found, _ = rider.settled(free)
-        attribution.take(Moment(100.0 * now, found, 0.7, AIR, 0.0, rider.forecast.hills))
-    (change,) = attribution.changes
+        explainer.take(100.0 * now, found, 0.7, AIR, 0.0, rider.forecast.hills)
+    (change,) = explainer.changes
     assert sum(change.causes.values()) == pytest.approx(change.range - change.reference, abs=1e-6)
     return change
 

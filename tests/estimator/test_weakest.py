@@ -15,7 +15,6 @@ import pytest
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator import outlook
-from gz_onboard.estimator.attribution import Moment
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.signals import Signals
@@ -176,14 +175,14 @@ def test_the_state_of_charge_stays_the_mean_cell_s():
 
 def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
     found = at(WEAK, 0.2)
-    attribution, weakest, ends = found.attribution, found.battery.health.weakest, []
+    explainer, weakest, ends = found.explainer, found.battery.health.weakest, []
     for known in (weakest, None):
         found.battery.weaken(known)
         soc, sd = found.soc.ageing.state_of_charge(found.filter)
         forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
-        ends.append(attribution._state(Moment(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0)))
+        ends.append(explainer.state(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0))
     found.battery.weaken(weakest)
-    with_it, without = (attribution.explained(attribution.rated, end) for end in ends)
+    with_it, without = (explainer.explain(explainer.rated, end) for end in ends)
     for why in (with_it, without):
         assert sum(why.causes.values()) == pytest.approx(why.range - why.reference, abs=1e-6)
     shorter = ends[1].range - ends[0].range
