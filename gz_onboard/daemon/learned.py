@@ -27,7 +27,7 @@ from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part, unlike
 from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
-from gz_onboard.estimator.weakest import Weakest
+from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -136,7 +136,7 @@ def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lea
 def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
     if all(source.role != LOWEST for source in vehicle.mapping.sources):
         return {}
-    weakest = Weakest(vehicle.pack.own(), Signals([(LOWEST, DEFAULT_STALE)]), vehicle.parameters)
+    weakest = WeakestGroup(vehicle.pack.own(), Signals([(LOWEST, DEFAULT_STALE)]), vehicle.parameters)
     with part("weakest"):
         weakest.take_on(weakest.read(snapshot.get("learned", {}).get("weakest")))
     return weakest.learned()

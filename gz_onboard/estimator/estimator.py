@@ -29,7 +29,7 @@ from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import COARSE, SLOW_GAP, SLOWEST, MessageTiming
-from gz_onboard.estimator.weakest import Weakest
+from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import NO_PACK, STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
@@ -102,7 +102,7 @@ class Estimator:
         self._sources = PackSources(self.signals, self.redundancy, battery, p)
         self._temperatures = Temperatures(self.signals, p)
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.redundancy.currents.sag)
-        self.forecaster.ageing, self.weakest = self.soc.ageing, Weakest(battery, self.signals, p)
+        self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
         self._inputs = ModelInputs(self.forecaster, self.motion, self._temperatures, self.soc, self._vibration)
 
     @property

@@ -15,7 +15,7 @@ from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.start import SOC_UNKNOWN_SD, Saved
-from gz_onboard.estimator.weakest import Weakest
+from gz_onboard.estimator.weakest import WeakestGroup
 
 VERSION = (
     3  # 2: the states of effects with memory; 3: odometer, own SOC and consumption, for the charge that flows uncounted
@@ -55,7 +55,7 @@ def read(
     key: str,
     age: float | None,
     effects: CellEffects,
-    learning: tuple[Ageing, Weakest],
+    learning: tuple[Ageing, WeakestGroup],
     restore_riding: Callable[[Mapping[str, Any]], None],
 ) -> Restored:
     """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding, and what was learned of the
@@ -85,7 +85,11 @@ def read(
 
 
 def mended(
-    saved: Mapping[str, Any], key: str, effects: CellEffects, learning: tuple[Ageing, Weakest], forecaster: Forecaster
+    saved: Mapping[str, Any],
+    key: str,
+    effects: CellEffects,
+    learning: tuple[Ageing, WeakestGroup],
+    forecaster: Forecaster,
 ) -> tuple[dict[str, Any], list[str]]:
     """`saved` without its parts that are damaged, and their names; of estimators that have taken up no state.
 
@@ -170,7 +174,7 @@ def _fits(name: str, check: Callable[[], object]) -> bool:
     return True
 
 
-def of_learned(ageing: Ageing, weakest: Weakest) -> dict[str, Any]:
+def of_learned(ageing: Ageing, weakest: WeakestGroup) -> dict[str, Any]:
     """What was learned of the vehicle, by name; of the weakest group only where its voltage is on the bus."""
     of_group = {"weakest": weakest.snapshot()} if weakest.mapped else {}
     return {**ageing.snapshot(), **of_group}
