@@ -247,7 +247,7 @@ class RangeExplainer:
         return Explanation(b.time, a.range, b.range + ridden, causes)
 
     def _energy(self, a: RangeState, b: RangeState, changed: Collection[Cause] = ()) -> float:
-        """Energy that can be drawn [J] at the charge of `a`; each cause in `changed` as in `b`, the others as in `a`."""
+        """Energy that can be drawn [J] at the charge of `a`; causes in `changed` as in `b`, the others as in `a`."""
         load, battery = self._load, (b if Cause.AGE in changed else a).battery
         lost = load.model.overpotential(battery, {"vibration": load.prior.vibration, "time_moving": AHEAD})
         cells = (b if Cause.TEMPERATURE in changed else a).cells
