@@ -9,14 +9,14 @@ observer finds all of the grade, more slowly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import asin, atan, atan2, cos, inf, nan, pi, sin
+from math import asin, atan, atan2, cos, exp, inf, pi, sin, sqrt
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.signals import FIX_3D, Signals
-from gz_onboard.events import Activity
+from gz_onboard.estimator.signals import FIX_3D, Signal, Signals
+from gz_onboard.events import WINDOW, Activity
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.sensors import grade_shown, speed_factors
-from gz_onboard.physics.vibration import FAST, SLOW, Vibration
+from gz_onboard.physics.vibration import FAST, SLOW
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class MotionConfig:
     max_drawing: float = 30.0  # that counts
     max_sample_interval: float = 0.034  # of the vertical acceleration: slower ones do not show a road's roughness
     vibration_after: float = 3 * SLOW  # of samples: 97 % of the value is there
-    stuck_after: float = 1.0  # of one and the same vertical acceleration, which no accelerometer gives
+    min_vibration_square: float = 1e-6  # (m/s²)²: less is a stuck sensor's, and rounding
 
 
 MOTION = MotionConfig()
@@ -253,40 +253,30 @@ class ActivityTracker:
 
 
 class VibrationMonitor:
-    """`Vibration` of the samples of accel_z as a bus brings them: some late, some lost, some stuck."""
+    """The RMS [m/s²] of the vertical acceleration that is faster than `FAST`, over about `SLOW`.
 
-    __slots__ = ("_before", "_count", "_same", "_since", "_time", "_vibration")
+    Too few samples, or a sensor that shows one and the same value, begin it anew: no accelerometer is that still.
+    """
 
     def __init__(self) -> None:
-        self._restart(-inf, nan)
+        self._since = self._time = -inf  # s: the first window and the last
+        self._square = 0.0  # (m/s²)²
 
-    def _restart(self, time: float, accel_z: float) -> None:
-        self._vibration = Vibration()
-        self._vibration.update(0.0, accel_z)
-        self._since = self._time = self._same = time  # s: the first sample, the last, the first of the last's value
-        self._before = accel_z
-        self._count = 0  # samples after the first
-
-    def update(self, time: float, accel_z: float) -> None:
-        """A sample [m/s²] at `time` [s]. After a gap, time that goes back or a stuck sensor all begins anew."""
-        dt = time - self._time
-        if dt == 0:
+    def step(self, now: float, accel_z: Signal) -> None:
+        """Take the samples of the window that ends at `now` [s]."""
+        n, mean = accel_z.count, accel_z.mean(now)
+        if n * MOTION.max_sample_interval < WINDOW or mean is None or accel_z.mean_square is None:
             return
-        if not 0 < dt <= FAST or time - self._same > MOTION.stuck_after:
-            same = self._same if accel_z == self._before and dt > 0 else time
-            self._restart(time, accel_z)
-            self._same = same
-            return
-        if accel_z != self._before:
-            self._before, self._same = accel_z, time
-        self._time = time
-        self._count += 1
-        self._vibration.update(dt, accel_z)
+        square = (accel_z.mean_square - mean * mean) * n / (n - 1)
+        dt = now - self._time
+        if square < MOTION.min_vibration_square or dt > 2 * WINDOW:
+            self._since, self._square = now, max(square, 0.0)
+        keep = exp(-WINDOW / n / FAST)  # of white shaking, `Vibration` shows this share
+        self._square += (1 - exp(-min(dt, WINDOW) / SLOW)) * (square * keep * keep * 2 / (1 + keep) - self._square)
+        self._time = now
 
     def value(self, now: float) -> float | None:
         """RMS [m/s²] at `now` [s]; None while samples are missing, too few, or have only just come again."""
-        elapsed = self._time - self._since
-        sparse = self._count * MOTION.max_sample_interval < elapsed
-        if now - self._time > FAST or elapsed < MOTION.vibration_after or sparse:
+        if now - self._time > 2 * WINDOW or self._time - self._since < MOTION.vibration_after:
             return None
-        return self._vibration.value
+        return sqrt(self._square)

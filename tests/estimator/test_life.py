@@ -100,7 +100,7 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
         assert soon.consumption_expected == pytest.approx(price(), rel=0.1)
     scooter.auxiliary = 400.0
     ride(600, 7.0)
-    why = e.attribution.latest.causes
+    why = e.explainer.latest.causes
     assert why[Cause.AUXILIARIES] < -5000.0
     assert abs(why[Cause.UNEXPLAINED]) < -0.3 * why[Cause.AUXILIARIES]
     saved = json.loads(json.dumps(e.snapshot("a")))
