@@ -7,13 +7,13 @@ reverse order, on average. That is its Shapley value as far as causes act alone 
 The consumption is modelled in parts, all in J/m of the distance, stops included:
 
     SPEED     keeping the speeds ridden, on a level and straight road without wind
-    STOPS     what accelerating, braking and standing add to that
-    CLIMB     what hills like those ridden add to it, up and down again; and those of a route ahead
-    TURNING   what bends add to it
-    WIND      what a steady wind over the land adds to it, averaged over all headings, if the model knows one
+    STOPS     accelerating, braking and standing, in addition to that
+    CLIMB     hills like those ridden, up and down again; and those of a route ahead
+    TURNING   bends
+    WIND      a steady wind over the land, averaged over all headings, if the model knows one
 
-What height and speed store is given back and is no cost. The rated range, which the present one is compared with, is
-that of the vehicle file's prior riding in mild air, without hills and wind, with its payload and its consumption
+Energy stored in height and speed is given back and is no cost. The rated range, which the present one is compared with,
+is that of the vehicle file's prior riding in mild air, without hills and wind, with its payload and its consumption
 factor, and of a full battery as new, at the same temperature.
 """
 
@@ -145,11 +145,11 @@ class RangeExplainer:
             self._news.append((False, self.latest))
 
     def forget(self, roles: Iterable[str]) -> None:
-        """Name these roles with the next change: what was learned of them is forgotten, as they are found faulty."""
+        """Name these roles with the next change: they are found faulty, and the learning from them is forgotten."""
         self._forgotten.update(roles)
 
     def news(self) -> list[tuple[bool, Explanation]]:
-        """What was explained since it was last asked for: (whether it is a change, explanation)."""
+        """Explanations since the last call: (whether it is a change, explanation)."""
         news = list(self._news)
         self._news.clear()
         return news
@@ -165,7 +165,7 @@ class RangeExplainer:
         ridden: float,
         hills: tuple[float, float] = (0.0, 0.0),
     ) -> RangeState:
-        """What the range of a `forecast` follows from; see `take`."""
+        """The state that the range of a `forecast` follows from; see `take`."""
         forecaster, pack = self._forecaster, self._new.own()
         riding, health = forecaster.riding, forecaster.battery.health
         pack.age(health.capacity, health.resistance)
@@ -197,7 +197,7 @@ class RangeExplainer:
 
     @cached_property
     def rated(self) -> RangeState:
-        """What the range is compared with: see above."""
+        """The range to compare with: see above."""
         load, battery = self._load, self._new
         parameters, prior = load.model.parameters, load.prior
         state = RangeState(
@@ -258,7 +258,7 @@ class RangeExplainer:
     def _cost(self, a: RangeState, b: RangeState, changed: Collection[Cause]) -> float:
         """Consumption [J/m]; of each cause in `changed` as in `b`, of the others as in `a`.
 
-        What is modelled, times the factor, times how the riding to come differs from that; and hills ahead.
+        It is the modelled one, times the factor, times how the riding to come differs from that; and hills ahead.
         """
 
         def of(cause: Cause) -> RangeState:
@@ -303,7 +303,7 @@ class RangeExplainer:
         return parts
 
     def _drawn(self, p: Point, part: Cause, air: Conditions, mass: float) -> float:
-        """What the riding of a point takes [J] at a steady speed and with what belongs to `part`."""
+        """Energy [J] to ride a point at a steady speed, with the motion that belongs to `part`."""
         q = self._load.quantities(p.speed, p.acceleration if part is Cause.STOPS else 0.0, air)
         q["mass"] = mass
         if self._load.extended:
@@ -329,7 +329,7 @@ class RangeExplainer:
 
 
 def _split(causes: Sequence[Cause], value: Callable[[Collection[Cause]], float]) -> Parts:
-    """What each of the causes makes of the difference between the value with none of them changed and with all."""
+    """Split the difference between the value with all causes changed and without any among them."""
     shares = dict.fromkeys(causes, 0.0)
     for order in (causes, causes[::-1]):
         changed: set[Cause] = set()

@@ -11,7 +11,7 @@ from gz_onboard.physics.battery import HALF_FULL
 
 
 class ModelInputs:
-    """What the model reads at present, and the power that it gives. All methods take the time [s]."""
+    """Present inputs of the model, and the power that it gives. All methods take the time [s]."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class ModelInputs:
         )
 
     def cell_inputs(self, now: float) -> dict[str, float]:
-        """What effects in the cells may read beside the cells' own."""
+        """Inputs of effects in the cells, apart from those of the cells themselves."""
         inputs = {"time_moving": self._forecaster.riding.time_moving}
         return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
 

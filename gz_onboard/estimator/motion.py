@@ -1,4 +1,4 @@
-"""How the vehicle moves, what it is doing, and how rough the road is.
+"""Motion of the vehicle, its activity, and the roughness of the road.
 
 Lean follows from the roll rate, drawn to the lean of the steady turn tan φ = -V·ψ'/g (Cossalter 2006, sec. 4.1; yaw is
 positive to the left, lean to the right). Grade follows from the accelerometer less the wheel's acceleration; its offset
@@ -99,9 +99,9 @@ class Motion:
         self._update_grade(now, dt, signals)
 
     def forget_grade(self, grade_offset: float, altitude_holds: bool) -> None:
-        """Begin the grade anew: a sensor that it was made from is faulty; `grade_offset` is still known.
+        """Start the grade again: a sensor that it was made from is faulty; `grade_offset` is still known.
 
-        altitude_holds: the observer goes on from the measured altitude. Where the fault led it to is no climb.
+        altitude_holds: the observer starts from the measured altitude. Where the fault led it is no climb.
         """
         self.grade_offset, self.accelerometer_grade = grade_offset, 0.0
         if altitude_holds:
@@ -169,7 +169,7 @@ class Motion:
 
 
 class ActivityTracker:
-    """Follows what the vehicle does: riding, standing, parked, charging. Only riding teaches what a kilometre costs.
+    """Follows whether the vehicle is ridden, stands, is parked or charged. Only riding teaches the consumption.
 
     A stop is short until it has lasted `stop_time`, or the key is turned off or the contactor opens: then it is parked.
     So it is with a charge plug in, and charging from the first charging current until none has flowed for
@@ -255,7 +255,7 @@ class ActivityTracker:
 class VibrationMonitor:
     """The RMS [m/s²] of the vertical acceleration that is faster than `FAST`, over about `SLOW`.
 
-    Too few samples, or a sensor that shows one and the same value, begin it anew: no accelerometer is that still.
+    It starts again after a gap, or with a sensor that shows one and the same value: no accelerometer is that still.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
-"""Range along a known road: what the rest of a route costs, what is left at its end, where the battery ends before.
+"""Range along a known road: energy to the end of a route, charge left there, or where the battery ends before.
 
 The forward model is ridden along the route at the speed that limits and bends allow, once, and again when the air has
-changed. The cost of the way is kept in two parts: that of the level road, which is corrected by what riding the route
-has cost so far (measured over modelled energy, a scalar Kalman filter), and what height adds, which is not. Until some
+changed. The cost of the way is kept in two parts: that of the level road, which is corrected by the cost of the part
+already ridden (measured over modelled energy, a scalar Kalman filter), and that of height, which is not. Until some
 of the route is ridden the correction is the consumption factor of the riding in general.
 
 The range is the distance along the route that the energy left goes, and beyond its end at the consumption expected
@@ -151,7 +151,7 @@ class PreparedRoute:
 
 @dataclass(frozen=True, slots=True)
 class RouteOutlook:
-    """What is known of the way ahead, by the names of `Estimate`; SI units. None: not known, or not on the route."""
+    """Forecast of the way ahead, by the names of `Estimate`; SI units. None: not known, or not on the route."""
 
     route_state: RouteState = RouteState.NONE
     route_along: float | None = None
@@ -189,7 +189,7 @@ class RouteForecaster:
         self._heights = HeightCheck()
 
     def prepare(self, route: Route) -> PreparedRoute:
-        """Make `route` ready, in any thread. The fastest of the prior riding stands in for limits."""
+        """Make `route` ready, in any thread. Without limits the fastest speed of the prior riding is the limit."""
         return PreparedRoute(route, max(speed for _, speed, _ in self._forecaster.load.prior.points))
 
     def follow(self, route: PreparedRoute | None) -> None:
@@ -239,7 +239,7 @@ class RouteForecaster:
         return self._ahead(route, costs, free, soc, loss_variance)
 
     def report(self, estimate: Estimate) -> None:
-        """Put what is known of the route into `estimate`."""
+        """Write the outlook into `estimate`."""
         if self._route:
             for name in _NAMES:
                 setattr(estimate, name, getattr(self.outlook, name))
@@ -324,7 +324,7 @@ class RouteForecaster:
     ) -> tuple[float, float, float]:
         """State of charge at the end of the route, P10 and P90, as shown; 0 where the battery ends before.
 
-        What is not known of the energy, beside the state of charge, counts for the part that the way takes.
+        The uncertainty of the energy, apart from the state of charge, counts for the part that the way takes.
         """
         if free.energy <= 0:
             return 0.0, 0.0, 0.0

@@ -2,7 +2,7 @@
 
 With a receiver and a route that has positions it is followed by both: the distance ridden says where the vehicle should
 be by now, and the nearest place of the route around there corrects that. So roads that the route takes twice, loops and
-turning back do not make it jump. Some way beside the route, or against its direction, and the vehicle is off it. Then
+turning back do not make it jump. After some way off the route, or against its direction, the vehicle has left it. Then
 all of the route is searched for the place that it is at, in the route's direction; of several, the one nearest to where
 the distance ridden since would have led.
 
@@ -67,7 +67,7 @@ class RoutePosition:
         return float(interp(along, self._distance, self._latitude)), (longitude + 180.0) % 360.0 - 180.0
 
     def update(self, moved: float, fix: tuple[float, float] | None, course: float | None) -> None:
-        """Go on by `moved` [m]; fix: latitude and longitude [deg], if known; course [rad], if it is moving."""
+        """Move by `moved` [m]; fix: latitude and longitude [deg], if known; course [rad], if it is moving."""
         self.along += moved
         if fix is None or not len(self._latitude):
             self._away += 0.0 if self.on else moved

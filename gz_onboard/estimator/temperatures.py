@@ -21,7 +21,8 @@ def at_rest(temperature: float) -> float:
 class Temperatures:
     """Remembers the cells' temperature, and how much warmer than the air their heat has made them.
 
-    What is not measured follows the pack's cooling network (`physics.cooling.pack_constants`, exact over any step).
+    A temperature that is not measured follows the pack's cooling network (`physics.cooling.pack_constants`), which is
+    exact over any step.
     """
 
     def __init__(self, signals: Signals, parameters: Parameters) -> None:

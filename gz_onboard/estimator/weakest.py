@@ -1,19 +1,19 @@
 """The weakest group of cells: how it differs from the mean cell, out of the lowest cell's voltage.
 
 The mean cell is that of the battery filter; this slow filter follows the difference to it (bar-delta filtering: Plett
-2009, EVS24). Both carry the same current, so that what the cell model errs by cancels in their difference,
+2009, EVS24). Both carry the same current, so that errors of the cell model cancel in their difference,
 
     V_low - V_mean = U(z - Δ) - U(z) - ρ·drop + b,      Δ = charge + capacity·(1 - z)
 
-with z the mean cell's state of charge, U the open-circuit voltage, and `drop` what the load takes from the mean cell's
-voltage. The state is `charge`, a difference in charge when full, `capacity`, one in capacity, ρ, one in resistance, and
+with z the mean cell's state of charge, U the open-circuit voltage, and `drop` the mean cell's voltage drop under
+load. The state is `charge`, a difference in charge when full, `capacity`, one in capacity, ρ, one in resistance, and
 b, the difference of the two sensors. It does not change between measurements: each block of some charge gives one of ρ,
 out of how the difference moves with the load within the block, and one of all four, out of its mean.
 
 A block that no group can have had is left out: above the mean, too far below, jumping, or not moving with the load. So
-is one that contradicts what is known, which then becomes less certain, for packs are balanced and mended. After many
-such blocks, or where the pack goes on though the group would long be empty, the signal is refused until it makes sense
-again. The lowest voltage is that of whichever group has it, so a small difference is mostly the spread of healthy
+is one that contradicts the belief, which then becomes less certain, for packs are balanced and mended. After many such
+blocks, or where the pack still delivers though the group would long be empty, the signal is refused until it makes
+sense again. The lowest voltage is that of whichever group has it, so a small difference is mostly the spread of healthy
 groups: little of it is used.
 """
 
@@ -181,7 +181,7 @@ class WeakestGroup:
         return {name: Learned(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
 
     def believed(self) -> WeakGroup | None:
-        """What is used: of a difference that is small beside its sd and healthy groups' spread next to nothing."""
+        """The group as the range uses it; a difference small against its sd and healthy groups' spread counts little."""
         known = self.known
         if known.blocks < CONFIG.proven:
             return None
@@ -195,7 +195,7 @@ class WeakestGroup:
     # --- learning ---------------------------------------------------------------------------------------------
 
     def step(self, now: float, reading: PackReading, temperature: float, soc: StateOfCharge) -> None:
-        """Take in what came since the last step, at `now` [s]; temperature: of the cells [degC]."""
+        """Take in the window that ends at `now` [s]; temperature: of the cells [degC]."""
         if soc.another_pack:
             self._begin_anew()
             self._battery.weaken(None)
@@ -240,7 +240,7 @@ class WeakestGroup:
         self._battery.weaken(self.believed())
 
     def _learned_from(self, block: VoltageBlock, soc: float) -> GroupBelief | None:
-        """What is known after a block; None if no group can have had such voltages."""
+        """The belief after a block; None if no group can have had such voltages."""
         config, n = CONFIG, block.count
         (dd, du, uu), mean, drop = block.scatter, block.d / n, block.u / n
         unexplained = max(dd - du * du / uu, 0.0) if uu > 0 else dd
@@ -273,12 +273,12 @@ class WeakestGroup:
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """What is to be kept over a restart; of: the capacity in the vehicle file."""
+        """The belief, to be kept over a restart; of: the capacity in the vehicle file."""
         known = self.known
         return {"of": self._battery.capacity, "means": known.means, "rows": known.rows, "blocks": known.blocks}
 
     def read(self, saved: Mapping[str, Any] | None) -> GroupBelief:
-        """What a snapshot holds: nothing learned if there is none, or if it is of another pack.
+        """The belief in a snapshot: nothing learned if there is none, or if it is of another pack.
 
         KeyError, TypeError or ValueError if it holds what cannot be.
         """
@@ -297,7 +297,7 @@ class WeakestGroup:
         return found
 
     def take_on(self, saved: GroupBelief) -> None:
-        """Go on from what `read` gave."""
+        """Continue from the belief that `read` gave."""
         self.known = self._undoubted = saved
         self._battery.weaken(self.believed())
 

@@ -76,8 +76,8 @@ def csv_rows(file: Path, max_bytes: int | None = None) -> list[tuple[int, list[s
 def separated(text: str) -> list[tuple[int, list[str]]]:
     """(line, fields) of each line of `text` but empty ones.
 
-    Fields are separated by what the header has most of: commas, semicolons or tabs. A comma in a number is a decimal
-    comma where it does not separate fields.
+    Fields are separated by the mark that the header has most of: commas, semicolons or tabs. A comma in a number is a
+    decimal comma where it does not separate fields.
     """
     mark = max(",;\t", key=text.partition("\n")[0].count)
     reader = csv.reader(text.splitlines(keepends=True), delimiter=mark)
@@ -120,7 +120,7 @@ def read_gpx(file: Path) -> Columns:
     A missing altitude is NaN. A point at the place of the one before is left out. A recorder begins a new segment after
     a pause and a new track after a day; a planner writes alternatives that way. Those that begin where the one before
     ends are one road; otherwise nobody knows which of them is meant, and InputError is raised, as for a file that is no
-    GPX and for what is no number. Errors name the point, counted from 1.
+    GPX and for a field that is no number. Errors name the point, counted from 1.
     """
     from xml.etree import ElementTree
 

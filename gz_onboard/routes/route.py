@@ -81,7 +81,7 @@ def read_route(file: Path | str) -> Route:
 
 
 def route_name(file: Path) -> str:
-    """What the route in `file` is called: the file's name without its endings."""
+    """The name of the route in `file`: the file's name without its endings."""
     return file.name.removesuffix(".gz").removesuffix(".gpx").removesuffix(".csv").removesuffix(".route")
 
 
@@ -150,7 +150,7 @@ def route_of(columns: Columns, name: str) -> Route:
 def _with_filled_heights(columns: Columns) -> Columns:
     """Interpolate missing heights; a warning says how many.
 
-    Missing is what is no number, no height of a road, or 0 on a road that is nowhere near sea level.
+    Missing are NaN, heights that no road has, and 0 on a road that is nowhere near sea level.
     """
     if "altitude_m" not in columns.values:
         return columns
@@ -209,7 +209,7 @@ def _distance(columns: Columns, steps: list[tuple[float, float]]) -> tuple[float
 def _course(
     columns: Columns, steps: list[tuple[float, float]], distance: tuple[float, ...]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Heading [rad] and curvature [1/m] at each point; what is not given follows from what is."""
+    """Heading [rad] and curvature [1/m] at each point, from positions or from the given curvature."""
     import numpy as np
 
     at = np.array(distance)
