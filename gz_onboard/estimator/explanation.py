@@ -23,7 +23,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
 from math import exp, sqrt
 
 from gz_onboard.constants import MILD
@@ -37,7 +36,7 @@ from gz_onboard.estimator.load_model import (
     Conditions,
     EffectInputs,
 )
-from gz_onboard.estimator.pattern import Point, cruise_of
+from gz_onboard.estimator.pattern import Point
 from gz_onboard.estimator.ridden import MEMORY
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
@@ -108,8 +107,8 @@ class RangeExplainer:
         self._calm = model if calm == model.effects else Model(calm, model.parameters)
         self._stores = {effect.name for effect in model.effects if effect.stores_energy}
         self._usual = tuple(
-            Point(share, share * speed, speed, acceleration, cruise=cruise_of(speed) if speed else -1, returns=False)
-            for share, speed, acceleration in sorted(prior.points, key=lambda point: point[1])
+            Point(share, share * speed, speed, acceleration, returns=False)
+            for share, speed, acceleration in prior.points
         )
 
     def take(
@@ -289,7 +288,8 @@ class RangeExplainer:
 
     def _modelled(self, points: Sequence[Point], air: Conditions, mass: float) -> Parts:
         """The parts of riding these `points`."""
-        distance, cruises, model = sum(p.distance for p in points), _cruises(points), self._load.model
+        distance, cruises = sum(p.distance for p in points), [p for p in points if p.speed]
+        model = self._load.model
         parts = dict.fromkeys(MODELLED, 0.0)
         parts[Cause.SPEED] = steady = sum(self._drawn(p, Cause.SPEED, air, mass) for p in cruises) / distance
         for part, ridden, counts in (
@@ -340,19 +340,3 @@ def _split(causes: Sequence[Cause], value: Callable[[Collection[Cause]], float])
             shares[cause] += (after - before) / 2
             before = after
     return shares
-
-
-def _cruises(points: Sequence[Point]) -> list[Point]:
-    """What moves, at its speed: one point of those that differ in acceleration only."""
-    cruises = []
-    for cruise, same in groupby(points, lambda p: p.cruise):
-        each = list(same) if cruise >= 0 else []
-        distance = sum(p.distance for p in each)
-        if not distance:
-            continue
-        speed = sqrt(sum(p.speed**2 * p.distance for p in each) / distance)
-        grade = sqrt(sum(p.grade**2 * p.distance for p in each) / distance)
-        turning = [(p.lateral**2 * p.time, p.time) for p in each if p.lateral is not None]
-        lateral = sqrt(sum(square for square, _ in turning) / sum(time for _, time in turning)) if turning else None
-        cruises.append(Point(distance / speed, distance, speed, 0.0, grade, lateral=lateral))
-    return cruises

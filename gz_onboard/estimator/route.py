@@ -47,7 +47,6 @@ class RouteConfig:
     detour_share: float = 0.1  # of a segment: ridden so much more or less, it teaches nothing
     evened_share: float = 0.6  # of the differences in cost along the route; slow roads have stops that no map shows
     min_course_speed: float = 3.0  # m/s: slower, the heading is noise
-    min_mean_speed: float = 0.5  # m/s, over a piece of the route
     ambient_step: float = 2.0  # K: at such a change the route is modelled again
     altitude_step: float = 200.0  # m: the same
 
@@ -118,7 +117,7 @@ class PreparedRoute:
         """Model the whole route in this `air`; time_moving: of the ride so far [s]. About 1 ms for each 10 km."""
         np = self._np
         length = np.diff(self.distance)
-        speed = np.maximum((self.speed[1:] + self.speed[:-1]) / 2, CONFIG.min_mean_speed)
+        speed = (self.speed[1:] + self.speed[:-1]) / 2
         times = length / speed
         acceleration = np.diff(self.speed**2) / (2 * length)
         moving = time_moving + np.cumsum(times)

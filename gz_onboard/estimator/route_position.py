@@ -25,7 +25,7 @@ METRES_PER_DEGREE = 111_200.0  # of latitude; 0.3 % off at most, over some hundr
 
 @dataclass(frozen=True)
 class PositionConfig:
-    """Constants of following a route; m unless stated."""
+    """Constants of following a route and comparing its heights; m unless stated."""
 
     off: float = 50.0  # from the route: a receiver in a town and a map are off by 20 m together
     leaving: float = 60.0  # ridden off the route before that is believed: receivers err for seconds
@@ -37,6 +37,11 @@ class PositionConfig:
     longitudinal: float = 5.0  # a metre along the route counts so much less than one beside it
     gain: float = 0.3  # share of the difference along the route that one fix corrects
     against: float = 2.0  # rad between the course and the route's heading: ridden the other way
+    compared: float = 1500.0  # over which heights are compared: a receiver's altitude drifts by some metres on it
+    min_compared: float = 700.0  # of that, before which nothing is said
+    heights_apart: float = 0.02  # of the way: differing by more they are of two roads
+    heights_alike: float = 0.01  # by less of one again
+    step: float = 100.0  # longer ones, or farther from the distance ridden: along the route it was placed elsewhere
 
 
 CONFIG = PositionConfig()
@@ -128,17 +133,6 @@ class RoutePosition:
         return self._distance[some][:-1] + share * length, off, turned
 
 
-@dataclass(frozen=True)
-class HeightConfig:
-    """Constants of the comparison of heights."""
-
-    length_m: float = 1500.0  # over which heights are compared: a receiver's altitude drifts by some metres on it
-    min_length_m: float = 700.0  # of that, before which nothing is said
-    apart: float = 0.02  # of the way: differing by more they are of two roads
-    alike: float = 0.01  # by less of one again
-    leap_m: float = 100.0  # from one update to the next, or beside what was ridden: along the route it was placed anew
-
-
 class HeightCheck:
     """Whether the hills of a route are those ridden: a file of another road, or in feet, has others.
 
@@ -155,15 +149,15 @@ class HeightCheck:
 
         climb: that the route gains between the two [m]; altitude: measured [m], None if it is not known.
         """
-        config, before = HeightConfig, self._before
+        config, before = CONFIG, self._before
         self._before = None if altitude is None else (along, altitude)
         if before is None or altitude is None:
             return
         way, gained = along - before[0], altitude - before[1]
-        if not 0 < way < config.leap_m or abs(way - ridden) > config.leap_m or abs(gained) > way:
+        if not 0 < way < config.step or abs(way - ridden) > config.step or abs(gained) > way:
             return
-        kept = exp(-way / config.length_m)
+        kept = exp(-way / config.compared)
         self._way, self._apart = kept * self._way + way, kept * self._apart + climb - gained
-        if self._way > config.min_length_m:
-            limit = config.alike if self.contradicts else config.apart
+        if self._way > config.min_compared:
+            limit = config.heights_alike if self.contradicts else config.heights_apart
             self.contradicts = abs(self._apart) > limit * self._way

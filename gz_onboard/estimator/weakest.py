@@ -181,7 +181,7 @@ class WeakestGroup:
         return {name: Learned(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
 
     def believed(self) -> WeakGroup | None:
-        """The group as the range uses it; a difference small against its sd and healthy groups' spread counts little."""
+        """The group as used; a difference that is small against its sd and healthy groups' spread counts little."""
         known = self.known
         if known.blocks < CONFIG.proven:
             return None
@@ -244,9 +244,10 @@ class WeakestGroup:
         config, n = CONFIG, block.count
         (dd, du, uu), mean, drop = block.scatter, block.d / n, block.u / n
         unexplained = max(dd - du * du / uu, 0.0) if uu > 0 else dd
+        noise = config.sample_sd**2 * max(uu, 1e-12)  # V⁴, of the block's response to the load
         if unexplained > (config.jump + config.jump_relative * abs(mean)) ** 2 * n:
             return None
-        known = self.known.conditioned((0.0, 0.0, uu, 0.0), -du - self.known.means[RESISTANCE] * uu, self._noise(uu))
+        known = self.known.conditioned((0.0, 0.0, uu, 0.0), -du - self.known.means[RESISTANCE] * uu, noise)
         alone = mean + known.means[RESISTANCE] * drop  # what the difference would be without load
         follows = config.lowest[RESISTANCE] < known.means[RESISTANCE] < config.highest[RESISTANCE]
         if not follows or not self._behind(soc, config.highest[CHARGE]) - self._above < alone < self._above:
@@ -261,10 +262,6 @@ class WeakestGroup:
             return self.known.with_wider_charge()
         learned = known.conditioned(slopes, residual, noise * config.place / config.block).within_limits()
         return replace(learned, blocks=self.known.blocks + 1)
-
-    def _noise(self, uu: float) -> float:
-        """Variance of a block's response to the load [V⁴], of which so much was seen."""
-        return CONFIG.sample_sd**2 * max(uu, 1e-12)
 
     def _behind(self, soc: float, by: float) -> float:
         """By how much the open-circuit voltage is higher [V] where it is `by` behind `soc`."""
