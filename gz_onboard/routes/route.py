@@ -1,11 +1,11 @@
-"""A route as distance, altitude, curvature, speed limit, and what else is known of the road.
+"""A route as distance, grade, curvature, speed limit, and whatever else is known of the road.
 
 Altitude of a map or a receiver is off by a metre or so from point to point, and a bare difference over 20 m would
 turn that into grades of 5 %. Grade is therefore the slope of the straight line fitted (least squares) to the altitudes
-within `GRADE_LENGTH_M` around a point: with 1 m of independent noise on a 20 m grid its error is 0.5 % (one sigma). A
-hill of wavelength λ shows 3 (sin x − x cos x)/x³ of its grade, x = π GRADE_LENGTH_M/λ: 94 % at 800 m, 77 % at 400 m.
-Curvature is found likewise, from the headings of the chords within `CURVE_LENGTH_M`; a bend shorter than the distance
-between points shows as a longer and gentler one.
+within a length L around a point (`RouteFileConfig.grade_length`): with 1 m of independent noise on a 20 m grid its error
+is 0.5 % (one sigma). A hill of wavelength λ shows 3 (sin x − x cos x)/x³ of its grade, x = π L/λ: 94 % at 800 m, 77 % at
+400 m. Curvature is found likewise, from the headings of chords; a bend shorter than the distance between points shows as
+a longer and gentler one.
 """
 
 from __future__ import annotations
@@ -25,18 +25,28 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-GRADE_LENGTH_M = 200.0
-CURVE_LENGTH_M = 40.0
-MIN_CHORD_M = 10.0  # shorter chords have no usable heading
-MAX_GRADE = 0.5  # sine; no road is steeper, a wrong unit is
-MIN_STEP_M = 0.001  # between points: longer than any rounding
-MIN_MOVE_M = 0.01  # between positions
-MAX_POINTS = 50_000  # 1000 km at 20 m
-MAX_LENGTH_M = 1e6  # reading a longer route takes more than 70 MB
-MAX_GAP_M = 5000.0  # points farther apart are places on the way, not the road
-ALTITUDES_M = -500.0, 9000.0
-NEAR_ZERO_M = 20.0  # a road at sea level has heights within; on any other a height of 0 is a missing one
-DISTANCE_RATIO = 0.5, 1.2  # of the positions' length over distance_m
+
+@dataclass(frozen=True)
+class RouteFileConfig:
+    """Constants of reading a route; m unless stated."""
+
+    grade_length: float = 200.0  # over which altitudes are fitted
+    curve_length: float = 40.0  # over which headings are fitted
+    min_chord: float = 10.0  # shorter chords have no usable heading
+    max_grade: float = 0.5  # sine; no road is steeper, a wrong unit is
+    min_step: float = 0.001  # between points: longer than any rounding
+    min_move: float = 0.01  # between positions
+    max_points: int = 50_000  # 1000 km at 20 m
+    max_length: float = 1e6  # reading a longer route takes more than 70 MB
+    max_gap: float = 5000.0  # points farther apart are places on the way, not the road
+    min_altitude: float = -500.0
+    max_altitude: float = 9000.0
+    near_zero: float = 20.0  # a road at sea level has heights within; on any other a height of 0 is a missing one
+    min_distance_ratio: float = 0.5  # of the positions' length over distance_m
+    max_distance_ratio: float = 1.2
+
+
+CONFIG = RouteFileConfig()
 _LIMITS = {f"speed_limit_{unit}": METRES_PER_SECOND[unit] for unit in ("mps", "kmh")}
 ROUTE_COLUMNS = (
     "distance_m",
@@ -98,18 +108,18 @@ def route_of(columns: Columns, name: str) -> Route:
     """The route in `columns`: distance_m along the road or latitude_deg and longitude_deg, or all three; and more.
 
     Optional are altitude_m (without it the route is level), curvature_1pm (otherwise from the positions, 0 without
-    these), speed_limit_mps or speed_limit_kmh, stop_s and headwind_mps. Altitude is smoothed over `GRADE_LENGTH_M`, the
-    heading for curvature over `CURVE_LENGTH_M`.
+    these), speed_limit_mps or speed_limit_kmh, stop_s and headwind_mps. Altitude and the heading for curvature are
+    smoothed, see `RouteFileConfig`.
 
     Raises InputError naming the place for a distance that does not increase, positions that do not move or do not fit
     the distance, points too far apart or too many, and values that no road has.
     """
-    if len(columns) > MAX_POINTS:
-        raise InputError(f"{columns.source}: has {len(columns)} points, must have at most {MAX_POINTS}")
+    if len(columns) > CONFIG.max_points:
+        raise InputError(f"{columns.source}: has {len(columns)} points, must have at most {CONFIG.max_points}")
     columns = _with_filled_heights(columns)
     values = columns.values
     for column, (low, high, unit) in {
-        "altitude_m": (*ALTITUDES_M, "m"),
+        "altitude_m": (CONFIG.min_altitude, CONFIG.max_altitude, "m"),
         "curvature_1pm": (-1.0, 1.0, "1/m"),
         "stop_s": (0.0, 3600.0, "s"),
         "headwind_mps": (-40.0, 40.0, "m/s"),
@@ -119,17 +129,17 @@ def route_of(columns: Columns, name: str) -> Route:
     steps = _steps(columns)
     distance = _distance(columns, steps)
     for row, (before, after) in enumerate(pairwise(distance), start=1):
-        if after - before > MAX_GAP_M:
+        if after - before > CONFIG.max_gap:
             raise columns.error(row, f"is {(after - before) / 1000:.1f} km from the point before: that is no road")
-    if distance[-1] > MAX_LENGTH_M:
-        length = f"is {distance[-1] / 1000:.0f} km long, must be at most {MAX_LENGTH_M / 1000:.0f} km"
+    if distance[-1] > CONFIG.max_length:
+        length = f"is {distance[-1] / 1000:.0f} km long, must be at most {CONFIG.max_length / 1000:.0f} km"
         raise InputError(f"{columns.source}: {length}; are distances in m?")
     heading, curvature = _course(columns, steps, distance)
     grade = (0.0,) * len(distance)
     if "altitude_m" in values:
-        grade = _slopes(distance, values["altitude_m"], distance, GRADE_LENGTH_M)
+        grade = _slopes(distance, values["altitude_m"], distance, CONFIG.grade_length)
     for row, sine in enumerate(grade):
-        if abs(sine) > MAX_GRADE:
+        if abs(sine) > CONFIG.max_grade:
             wrong = f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are heights and distances in m?"
             raise columns.error(row, wrong)
     return Route(
@@ -157,9 +167,9 @@ def _with_filled_heights(columns: Columns) -> Columns:
     import numpy as np
 
     heights = np.array(columns.values["altitude_m"])
-    missing = ~((heights >= ALTITUDES_M[0]) & (heights <= ALTITUDES_M[1]))
+    missing = ~((heights >= CONFIG.min_altitude) & (heights <= CONFIG.max_altitude))
     others = np.abs(heights[~missing & (heights != 0)])
-    if others.size and others.min() > NEAR_ZERO_M:
+    if others.size and others.min() > CONFIG.near_zero:
         missing |= heights == 0
     count = int(missing.sum())
     if not 0 < 2 * count < len(heights):
@@ -183,7 +193,7 @@ def _steps(columns: Columns) -> list[tuple[float, float]]:
     points = zip(columns.values["latitude_deg"], columns.values["longitude_deg"], strict=True)
     steps = [east_north(start, end) for start, end in pairwise(points)]
     for row, step in enumerate(steps, start=1):
-        if math.hypot(*step) < MIN_MOVE_M:
+        if math.hypot(*step) < CONFIG.min_move:
             raise columns.error(row, "latitude_deg, longitude_deg: the same position as before")
     return steps
 
@@ -198,9 +208,9 @@ def _distance(columns: Columns, steps: list[tuple[float, float]]) -> tuple[float
         raise InputError(f"{columns.source}: needs column distance_m, or latitude_deg and longitude_deg")
     if given is None:
         return tuple(np.concatenate(([0.0], np.cumsum(lengths))).tolist())
-    columns.check_increasing("distance_m", "m", MIN_STEP_M)
+    columns.check_increasing("distance_m", "m", CONFIG.min_step)
     length = given[-1] - given[0]
-    if steps and not DISTANCE_RATIO[0] < sum(lengths) / length < DISTANCE_RATIO[1]:
+    if steps and not CONFIG.min_distance_ratio < sum(lengths) / length < CONFIG.max_distance_ratio:
         wrong = f"distance_m covers {length:.0f} m, latitude_deg and longitude_deg {sum(lengths):.0f} m"
         raise InputError(f"{columns.source}: {wrong}; is distance_m in m?")
     return tuple(d - given[0] for d in given)
@@ -220,13 +230,13 @@ def _course(
         return (0.0, *(-turned).tolist()), curvature
     ends = [0]
     for i, along in enumerate(distance):
-        if along - distance[ends[-1]] >= MIN_CHORD_M:
+        if along - distance[ends[-1]] >= CONFIG.min_chord:
             ends.append(i)
     ends = ends if len(ends) > 1 else [0, len(distance) - 1]
     east, north = np.diff(np.concatenate(([(0.0, 0.0)], np.cumsum(steps, axis=0)))[ends], axis=0).T
     headings, middles = np.unwrap(np.arctan2(east, north)), (at[ends][1:] + at[ends][:-1]) / 2
     if "curvature_1pm" not in columns.values and len(middles) > 1:
-        curvature = tuple(-slope for slope in _slopes(middles, headings, at, CURVE_LENGTH_M))
+        curvature = tuple(-slope for slope in _slopes(middles, headings, at, CONFIG.curve_length))
     return tuple(np.interp(at, middles, headings).tolist()), curvature
 
 

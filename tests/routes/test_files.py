@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.errors import InputError
 from gz_onboard.routes.columns import MAX_BYTES
 from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import MAX_POINTS, read_route, read_route_columns
+from gz_onboard.routes.route import CONFIG, read_route, read_route_columns
 
 HEAD = '<?xml version="1.0"?>\n<gpx xmlns="http://www.topografix.com/GPX/1/1">\n'
 
@@ -156,7 +156,10 @@ def test_what_is_no_gpx_is_refused(tmp_path, text, message):
         ("distance_m\n0\n20\n20.0001\n", r":4: distance_m: 20\.0001 m does not increase"),
         ("distance_m\n0\n5e-324\n", r":3: distance_m: 4.94066e-324 m does not increase"),
         ("distance_m\n0\n20000\n", r":3: is 20\.0 km from the point before"),
-        ("distance_m\n" + "".join(f"{i}\n" for i in range(MAX_POINTS + 1)), rf"has {MAX_POINTS + 1} points, must"),
+        (
+            "distance_m\n" + "".join(f"{i}\n" for i in range(CONFIG.max_points + 1)),
+            rf"has {CONFIG.max_points + 1} points, must",
+        ),
     ],
 )
 def test_csv_refused(tmp_path, text, message):
