@@ -2,10 +2,10 @@
 
 Altitude of a map or a receiver is off by a metre or so from point to point, and a bare difference over 20 m would
 turn that into grades of 5 %. Grade is therefore the slope of the straight line fitted (least squares) to the altitudes
-within a length L around a point (`RouteFileConfig.grade_length`): with 1 m of independent noise on a 20 m grid its error
-is 0.5 % (one sigma). A hill of wavelength λ shows 3 (sin x − x cos x)/x³ of its grade, x = π L/λ: 94 % at 800 m, 77 % at
-400 m. Curvature is found likewise, from the headings of chords; a bend shorter than the distance between points shows as
-a longer and gentler one.
+within a length L around a point (`RouteFileConfig.grade_length`): with 1 m of independent noise on a 20 m grid its
+error is 0.5 % (one sigma). A hill of wavelength λ shows 3 (sin x − x cos x)/x³ of its grade, x = π L/λ: 94 % at 800 m,
+77 % at 400 m. Curvature is found likewise, from the headings of chords; a bend shorter than the distance between points
+shows as a longer and gentler one.
 """
 
 from __future__ import annotations
