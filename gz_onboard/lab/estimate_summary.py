@@ -70,7 +70,7 @@ class RideSummary:
     changes: Annotated[
         list[Why],
         "each change of the range by 1 km more or less than was ridden, and why; its range_km is the range then plus "
-        "what was ridden since reference_km; a charge is one change",
+        "what was ridden since reference_km; a charge is one change, told when it is over",
     ]
     route: Annotated[
         RouteSummary | None,
