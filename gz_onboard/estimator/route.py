@@ -288,8 +288,10 @@ class RouteForecaster:
         level = cost * route.between(costs.level, here, route.length)
         needed = level + route.between(costs.height, here, route.length)
 
+        total = cost * costs.level + costs.height
+
         def reach(energy: float) -> float:
-            found = route.reach(cost * costs.level + costs.height, here, energy)
+            found = route.reach(total, here, energy)
             return left + (energy - needed) / free.consumption if found is None else found
 
         def relative_sd(way: float) -> float:

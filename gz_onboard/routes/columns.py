@@ -9,7 +9,7 @@ import re
 import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest, shown, unreadable
@@ -135,27 +135,27 @@ def read_gpx(file: Path) -> Columns:
         raise InputError(f"{file}: cannot be read: {error}; save it as UTF-8") from error
     tracks = [segment.findall("{*}trkpt") for segment in root.iterfind(".//{*}trkseg")]
     parts = list(filter(None, tracks)) or [route.findall("{*}rtept") for route in root.iterfind("{*}rte")]
-    rows: list[tuple[float, float, float]] = []
-    for part in parts:
-        for number, point in enumerate(part):
-            place = f"{file}: point {len(rows) + 1}: "
-            lat, lon = (_number(place + axis, point.get(axis, "")) for axis in ("lat", "lon"))
+    starts = {id(part[0]) for part in parts if part}
+    rows: dict[str, tuple[float, float, float]] = {}  # by place in the file
+    before: tuple[float, float] | None = None
+    for number, point in enumerate(chain.from_iterable(parts), start=1):
+        place = f"{file}: point {number}"
+        here = _number(f"{place}: lat", point.get("lat", "")), _number(f"{place}: lon", point.get("lon", ""))
+        gap = math.hypot(*east_north(before, here)) if before and id(point) in starts else 0.0
+        if gap > MAX_GPX_GAP_M:
+            apart = f"{len(parts)} tracks or segments, which do not join: {gap / 1000:.1f} km lie before this one"
+            raise InputError(f"{place}: has {apart}; keep the one that is the road")
+        if here != before:
             altitude = (point.findtext("{*}ele") or "").strip()
-            row = lat, lon, _number(f"{place}ele", altitude) if altitude else math.nan
-            gap = math.hypot(*east_north(rows[-1][:2], row[:2])) if rows and number == 0 else 0.0
-            if gap > MAX_GPX_GAP_M:
-                apart = (
-                    f"has {len(parts)} tracks or segments, which do not join: {gap / 1000:.1f} km lie before this one"
-                )
-                raise InputError(f"{place}{apart}; keep the one that is the road")
-            if not rows or row[:2] != rows[-1][:2]:
-                rows.append(row)
+            rows[place] = *here, _number(f"{place}: ele", altitude) if altitude else math.nan
+        before = here
     if len(rows) < MIN_ROWS:
         raise InputError(f"{file}: has {len(rows)} points of a track or a route, must have at least {MIN_ROWS}")
-    values = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), zip(*rows, strict=True), strict=True))
+    names = "latitude_deg", "longitude_deg", "altitude_m"
+    values = dict(zip(names, zip(*rows.values(), strict=True), strict=True))
     if 2 * sum(map(math.isnan, values["altitude_m"])) >= len(rows):
         del values["altitude_m"]
-    return Columns(str(file), tuple(f"{file}: point {i + 1}" for i in range(len(rows))), values)
+    return Columns(str(file), tuple(rows), values)
 
 
 def east_north(start: tuple[float, float], end: tuple[float, float]) -> tuple[float, float]:
