@@ -25,6 +25,7 @@ from math import hypot, inf, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ageing import SAME, Learned
+from gz_onboard.estimator.saved_fields import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading
@@ -297,6 +298,10 @@ class WeakestGroup:
         """Continue from the belief that `read` gave."""
         self.known = self._undoubted = saved
         self._battery.weaken(self.believed())
+
+
+FIELDS = {"of": FINITE, "means": Each(FINITE, 4), "rows": Each(Each(FINITE, 4), 4), "blocks": Number(0.0)}
+"""Of the saved state; `WeakestGroup.read` knows their bounds."""
 
 
 def _trusted(difference: float, sd: float) -> float:
