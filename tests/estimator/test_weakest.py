@@ -162,7 +162,7 @@ def test_without_the_signal_nothing_is_known():
             break
         estimator.handle((time, group, values[:2]))
     assert estimator.battery.health.weakest is None
-    assert estimator.snapshot("key")["learned"]["weakest"]["known"]["blocks"] == 0
+    assert estimator.snapshot("key")["learned"]["weakest"]["blocks"] == 0
 
 
 def test_the_state_of_charge_stays_the_mean_cell_s():
