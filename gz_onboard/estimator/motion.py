@@ -15,8 +15,7 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.signals import FIX_3D, Signal, Signals
 from gz_onboard.events import WINDOW, Activity
 from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.sensors import grade_shown, speed_factors
-from gz_onboard.physics.vibration import FAST, SLOW
+from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, grade_shown, speed_factors
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class MotionConfig:
     drawing_after: float = 10.0  # of that, less the time without: the speed is wrong
     max_drawing: float = 30.0  # that counts
     max_sample_interval: float = 0.034  # of the vertical acceleration: slower ones do not show a road's roughness
-    vibration_after: float = 3 * SLOW  # of samples: 97 % of the value is there
+    vibration_after: float = 3 * VIBRATION_MEMORY_S  # of samples: 97 % of the value is there
     min_vibration_square: float = 1e-6  # (m/s²)²: less is a stuck sensor's, and rounding
 
 
@@ -253,7 +252,7 @@ class ActivityTracker:
 
 
 class VibrationMonitor:
-    """The RMS [m/s²] of the vertical acceleration that is faster than `FAST`, over about `SLOW`.
+    """The vibration, as `physics.sensors.Vibration` defines it [m/s²], from windows of samples.
 
     It starts again after a gap, or with a sensor that shows one and the same value: no accelerometer is that still.
     """
@@ -271,8 +270,9 @@ class VibrationMonitor:
         dt = now - self._time
         if square < MOTION.min_vibration_square or dt > 2 * WINDOW:
             self._since, self._square = now, max(square, 0.0)
-        keep = exp(-WINDOW / n / FAST)  # of white shaking, `Vibration` shows this share
-        self._square += (1 - exp(-min(dt, WINDOW) / SLOW)) * (square * keep * keep * 2 / (1 + keep) - self._square)
+        keep = exp(-WINDOW / n / VIBRATION_PERIOD_S)  # of white shaking, `Vibration` shows this share
+        fade = exp(-min(dt, WINDOW) / VIBRATION_MEMORY_S)
+        self._square = fade * self._square + (1 - fade) * square * keep * keep * 2 / (1 + keep)
         self._time = now
 
     def value(self, now: float) -> float | None:
