@@ -158,7 +158,7 @@ def modelled(e):
 
 @pytest.fixture(scope="module")
 def quiet(rough):
-    return estimated(rough, events(240, 1e-6))
+    return estimated(rough, events(240, 0.01))
 
 
 def test_the_road_load_is_that_of_the_shaking(rough, quiet):
@@ -238,7 +238,7 @@ def test_what_was_learned_outlives_a_restart(rough):
 def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     """In the cells too it is what is felt, and the typical for the energy left."""
     loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
-    for vibration in (1e-6, 2.5):
+    for vibration in (0.01, 2.5):
         e = estimated(loose, events(60, vibration))
         assert e.soc.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
     settled = e.forecaster._overpotential
