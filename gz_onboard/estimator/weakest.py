@@ -59,6 +59,7 @@ class WeakestConfig:
     jump_relative: float = 0.1  # of the difference: where it falls fast
     gate: float = 5.0  # sd: a block that is further off is left out
     misfit_sd: float = 0.0007  # of SOC: what such a block adds to what is not known
+    walk_sd: float = 0.0005  # of SOC: change of the charge over a block, by leaks, balancing and errors of the curve
     past_empty: float = 0.02  # of SOC, beside two sd: a group believed to be emptier while charge flows is no group
     doubt_gain: float = 0.15  # share of the next block in the doubt
     refused_from: float = 0.5  # doubt
@@ -130,10 +131,10 @@ class GroupBelief:
         )
         return GroupBelief(tuple(means), tuple(rows), self.blocks + 1)
 
-    def with_wider_charge(self) -> GroupBelief:
-        """Less certain of the charge, but never less than before the first block."""
+    def with_wider_charge(self, sd: float) -> GroupBelief:
+        """Less certain of the charge by a change of `sd`, but never less than before the first block."""
         (own, *others), *rows = self.rows
-        wider = max(min(own + CONFIG.misfit_sd**2, CONFIG.prior_sd[CHARGE] ** 2), own)
+        wider = max(min(own + sd**2, CONFIG.prior_sd[CHARGE] ** 2), own)
         return replace(self, rows=((wider, *others), *rows))
 
     def within_limits(self) -> GroupBelief:
@@ -260,7 +261,8 @@ class WeakestGroup:
         slopes = -slope, -slope * (1 - soc), -drop, 1.0
         residual = alone - predicted - known.means[OFFSET]
         if residual**2 > config.gate**2 * (noise + known.variance(slopes)):
-            return self.known.with_wider_charge()
+            return self.known.with_wider_charge(config.misfit_sd)
+        known = known.with_wider_charge(config.walk_sd)
         learned = known.conditioned(slopes, residual, noise * config.place / config.block).within_limits()
         return replace(learned, blocks=self.known.blocks + 1)
 

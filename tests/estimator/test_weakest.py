@@ -264,7 +264,7 @@ def test_a_lie_changes_nothing_that_was_learned(name: str):
     saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]  # charged meanwhile
     found = ridden(WEAK, 0.57, LIES[name](), saved)
     for x, learned in found.weakest.learned().items():
-        assert abs(learned.value - known[x].value) < known[x].sd
+        assert abs(learned.value - known[x].value) < 1.5 * known[x].sd
     assert found.battery.health.weakest.capacity > 0.05
 
 
