@@ -70,7 +70,7 @@ def test_a_scooter_in_a_van_is_parked(witness):
     riding = e.forecaster.riding
     for event in stand(180, 0.0, 0.0, (0.0, 0.0)):
         e.handle(event)
-    before = riding.usual, e.road.distance
+    before = riding.usual, e.motion.distance
     seen = set()
     for event in stand(1200, 180.0, 15.0, (0.0, 0.0)):
         e.handle(event)
@@ -80,4 +80,4 @@ def test_a_scooter_in_a_van_is_parked(witness):
     assert not estimate.distrusted
     assert riding.usual == before[0]
     assert seen == {(Activity.PARKED, ())}
-    assert e.road.distance == before[1]
+    assert e.motion.distance == before[1]
