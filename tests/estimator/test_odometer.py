@@ -94,4 +94,4 @@ def test_a_speed_of_zero_with_the_current_of_a_drive_is_no_standing():
     dead = ((t, g, (0.0,) if g == MOTOR else v) for t, g, v in scooter.live(60, 10.0))
     rows = follow(e, dead, scooter)
     assert all(row.activity is Activity.UNKNOWN for _, row in rows[15:40])
-    assert not e._activities.teaches
+    assert not e._activity.teaches
