@@ -245,7 +245,7 @@ class Pipeline:
         """What the estimates of a log do not say of the ride, since the start."""
         last, estimator = self.last or Estimate(0.0), self.estimator
         return ride_row(
-            last, self.drawn, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.riders.now
+            last, self.drawn, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.learner.rider
         )
 
 

@@ -46,7 +46,7 @@ def saved(tmp_path: Path) -> Path:
 def shown(file: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, dict[str, float]]:
     assert main(["learned", "--state", str(file), "--json", *options]) == OK
     document = json.loads(capsys.readouterr().out)
-    assert document["version"] == 3
+    assert document["version"] == 4
     learned: dict[str, dict[str, float]] = document["learned"]
     return learned
 
@@ -67,8 +67,9 @@ def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     snapshot, _ = state.load(saved, time.time()) or ({}, None)
     estimator = Pipeline(vehicle).estimator
     estimator.restore(snapshot, vehicle.key, 0.0)
-    usual = estimator.forecaster.riding.usual
-    estimator.forecaster.riding.usual = replace(usual, price=replace(usual.price, usual=1.2, usual_variance=0.01**2))
+    learner = estimator.forecaster.learner
+    price = replace(learner.habits.price, level=1.2, level_variance=0.01**2)
+    learner.state = replace(learner.state, habits=replace(learner.habits, price=price))
     estimator.forecaster.ridden_by("anna")
     estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
     changed = estimator.snapshot(vehicle.key)

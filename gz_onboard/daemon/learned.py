@@ -22,16 +22,15 @@ from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
+from gz_onboard.estimator.consumption import CONSUMPTION, Habits, Quantity, Terrain
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part, unlike
-from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain
-from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-VERSION = 3  # of the JSON keys
+VERSION = 4  # of the JSON keys
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
@@ -40,11 +39,11 @@ MEANING = {  # by name: what its factor is on
     "weak_capacity": "of that group, over the mean cell's",
     "weak_resistance": "of that group, over the mean cell's",
     "price": "energy of a kilometre in motion, over the prior riding's in the vehicle file",
-    "standing": "energy at stops, likewise",
+    "stops": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": f"how far {STRETCH / 1000:.0f} km of road end above or below their begin, whoever rides, "
-    f"over the {sqrt(STRETCH * RATE):.0f} m expected before the first ride",
+    "terrain": f"how far {CONSUMPTION.stretch_m / 1000:.0f} km of road end above or below their begin, whoever rides, "
+    f"over the {sqrt(CONSUMPTION.stretch_m * CONSUMPTION.terrain_rate):.0f} m expected before the first ride",
 }
 TERRAIN = "terrain"
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
@@ -145,28 +144,28 @@ def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lear
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
     """What a saved state holds of the riding, by rider and name; who rode last comes first. ValueError likewise."""
     forecaster = _fresh(vehicle)
-    prior = forecaster.prior
+    learner = forecaster.learner
     with part(RIDING):
         forecaster.restore(snapshot["riding"])
-    now = forecaster.riders.now
-    riders = {now: forecaster.riding.usual, **forecaster.riders.others}
-    found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
-    found[now][TERRAIN] = _of_terrain(forecaster.terrain)
+    riders = {learner.rider: learner.habits, **learner.other_riders}
+    found = {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
+    found[learner.rider][TERRAIN] = _of_terrain(learner.state.terrain)
     return found
 
 
-def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
-    names = [field.name for field in fields(Usual)]
-    return {name: _of_habit(getattr(usual, name), getattr(prior, name)) for name in names}
+def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
+    names = [field.name for field in fields(Habits)]
+    return {name: _of_quantity(getattr(habits, name), getattr(prior, name)) for name in names}
 
 
-def _of_habit(habit: Habit, prior: Habit) -> Learned:
-    sd, unknown = sqrt(habit.usual_variance), sqrt(prior.usual_variance)
-    return Learned(habit.usual / prior.usual, sd / prior.usual, max(1 - sd / unknown, 0.0))
+def _of_quantity(quantity: Quantity, prior: Quantity) -> Learned:
+    sd, unknown = sqrt(quantity.level_variance), sqrt(prior.level_variance)
+    return Learned(quantity.level / prior.level, sd / prior.level, max(1 - sd / unknown, 0.0))
 
 
 def _of_terrain(terrain: Terrain) -> Learned:
-    return Learned(sqrt(terrain.rate / RATE), terrain.relative_sd * sqrt(terrain.rate / RATE), terrain.share)
+    factor = sqrt(terrain.rate / CONSUMPTION.terrain_rate)
+    return Learned(factor, terrain.relative_sd * factor, terrain.share)
 
 
 def _fresh(vehicle: Vehicle) -> Forecaster:

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 from gz_onboard.constants import MILD
 from gz_onboard.estimator.composition import PARTS, Composition, Parts
-from gz_onboard.estimator.forecast import PRIOR_FORM_FACTOR_SQUARED, Forecast, Forecaster
+from gz_onboard.estimator.consumption import CONSUMPTION
+from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions
 from gz_onboard.estimator.pattern import Point
-from gz_onboard.estimator.ridden import MEMORY
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
 from gz_onboard.physics.battery import Battery, Overpotential
@@ -134,7 +134,7 @@ class Attribution:
 
     def _state(self, moment: Moment) -> State:
         now, forecast, soc, air, ridden, (energy, way) = moment
-        riding = self._forecaster.riding
+        learner = self._forecaster.learner
         known = forecast.range > 0 and forecast.energy > 0
         state = State(
             time=now,
@@ -145,10 +145,10 @@ class Attribution:
             draw=Draw(soc, forecast.cells, self._pack(), forecast.power, forecast.form_factor_squared),
             air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
             mass=self._forecaster.load.model.mass,
-            factor=self._forecaster.factor,
+            factor=learner.consumption_factor,
             auxiliaries=self._auxiliaries(forecast.power),
-            points=self._forecaster.pattern.points(),
-            known=min(max(1 - riding.usual.price.variance / self._forecaster.prior.price.variance, 0.0), 1.0),
+            points=learner.pattern.points(),
+            known=learner.price_known,
         )
         like_ridden = way * state.factor * self._parts(state, state.air, state.mass)[Cause.CLIMB]
         return replace(state, hills=(energy - like_ridden) / state.range if known else 0.0)
@@ -159,22 +159,17 @@ class Attribution:
         beside = [self._signals[role].get(now) for role in LOADS]
         known = [power for power in beside if power is not None]
         if way > 0 and known:
-            fade = exp(-way / MEMORY)
+            fade = exp(-way / CONSUMPTION.memory_m)
             self._more = fade * self._more + (1 - fade) * sum(known)
             self._known = fade * self._known + 1 - fade
 
     def _auxiliaries(self, power: float) -> float:
         """The part of the consumption factor that they make, as far as it is in it; `power` [W]: expected."""
-        by_sensor = self._forecaster.beside
+        learner = self._forecaster.learner
+        by_sensor = learner.auxiliary_factor
         if not self._known or power <= 0:
             return by_sensor
-        return by_sensor + self._factor_learned * self._forecaster.riding.factor * self._more / self._known / power
-
-    @property
-    def _factor_learned(self) -> float:
-        """How much of what the parameters have wrong is in the consumption expected: 0 to 1."""
-        prior = self._forecaster.load.prior.factor_sd
-        return min(max(1 - self._forecaster.riding.factor_variance / prior**2, 0.0), 1.0)
+        return by_sensor + learner.factor_known * learner.factor * self._more / self._known / power
 
     @property
     def rated(self) -> State:
@@ -187,7 +182,7 @@ class Attribution:
             calm = _without_hills_and_wind(self._composition.prior(air, mass))
             consumption = prior.factor * sum(calm.values())
             full, power = self._new.window.of_cells(1.0), consumption * prior.speed
-            load_ahead = power, PRIOR_FORM_FACTOR_SQUARED
+            load_ahead = power, CONSUMPTION.form_factor_squared
             lost = self._overpotential(self._new)
             cells = cells_ahead(self._new, self._forecaster.cooling, (full, MILD), MILD, load_ahead, lost)
             draw = Draw(full, cells, self._new, *load_ahead)

@@ -237,7 +237,7 @@ class Estimator:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        towed = self.forecaster.riding.towed  # then no energy of the bus shows a grade
+        towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
         before = grades.faulty
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
@@ -252,7 +252,7 @@ class Estimator:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
             self.attribution.forget(forgotten)
         if "auxiliary_current" in newly:
-            self.forecaster.auxiliaries.forget()
+            self.forecaster.learner.auxiliaries.forget()
         if newly & AGED_FROM:
             self.soc.ageing.unlearn()
 
@@ -273,7 +273,7 @@ class Estimator:
         self._activities.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
-        self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
+        self.forecaster.learner.auxiliaries.step(min(dt, self._timing.pause), measured)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
@@ -282,11 +282,11 @@ class Estimator:
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
             still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
-            self.forecaster.pause(still)
+            self.forecaster.learner.pause(still)
             return
         power = reading.voltage * reading.current
         self.ahead.ride(dt, speed, power)
-        learned = self.forecaster.ride(
+        learned = self.forecaster.learner.ride(
             dt,
             speed,
             self.road.grade,
@@ -297,7 +297,7 @@ class Estimator:
             self._drive(now, reading.voltage, power),
         )
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
-            self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
+            self.redundancy.currents.compare_consumption(self.forecaster.learner.recent_factor)
 
     def _drive(self, now: float, voltage: float, power: float) -> float:
         """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
@@ -307,7 +307,7 @@ class Estimator:
             return voltage * current
         if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
             return torque * turning
-        return power - self.forecaster.auxiliaries.total
+        return power - self.forecaster.learner.auxiliaries.total
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
@@ -394,7 +394,7 @@ class Estimator:
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
-        self.forecaster.pause(NEW_DAY if restored.age is None else restored.age)
+        self.forecaster.learner.pause(NEW_DAY if restored.age is None else restored.age)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

@@ -34,7 +34,7 @@ class Present:
     @property
     def time_moving(self) -> float:
         """See `QUANTITIES` [s]."""
-        return self._forecaster.riding.time_moving
+        return self._forecaster.learner.time_moving
 
     def power(self, now: float) -> float:
         """What the pack gives [W]."""
@@ -73,7 +73,7 @@ class Present:
 
     def cell_inputs(self, now: float) -> dict[str, float]:
         """What effects in the cells may read beside the cells' own."""
-        inputs = {"time_moving": self._forecaster.riding.time_moving}
+        inputs = {"time_moving": self._forecaster.learner.time_moving}
         return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
 
     def vibration(self, now: float) -> float:

@@ -101,16 +101,16 @@ class RoadAhead:
             self._last = road.route
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
         self._distance, self._new, self._heights = self._motion.distance, True, RouteHeights()
-        self._forecaster.calm.show_next()
+        self._forecaster.smoother.show_next()
         self.answer = Answer(RouteState.OFF if road else RouteState.NONE)
 
     # --- learning ---------------------------------------------------------------------------------------------
 
     def ride(self, dt: float, speed: float, power: float) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
-        if self._segment and not self._forecaster.riding.towed:
+        if self._segment and not self._forecaster.learner.towed:
             self._ridden += abs(speed) * dt
-            self._energy += (power - self._forecaster.auxiliaries.now) * dt
+            self._energy += (power - self._forecaster.learner.auxiliaries.now) * dt
 
     def _learn(self, road: Road, costs: Costs) -> None:
         """Learn the cost if a segment ends here."""
@@ -139,8 +139,8 @@ class RoadAhead:
 
     @property
     def _factor(self) -> tuple[float, float]:
-        riding = self._forecaster.riding
-        return riding.factor, riding.factor_variance
+        learner = self._forecaster.learner
+        return learner.factor, learner.habits.factor.variance
 
     @property
     def _known_from(self) -> float:
@@ -159,13 +159,13 @@ class RoadAhead:
         if not road.position.on or self._heights.contradict or self._costs is None:
             if self.answer.state is RouteState.ON:  # left: what lay ahead on it is no part of the range
                 self._new = True
-                self._forecaster.calm.show_next()
+                self._forecaster.smoother.show_next()
             self._segment, self.answer = None, Answer(RouteState.OFF)
             return free
         self._learn(road, self._costs)
         if self._new:
             self._new = False
-            self._forecaster.calm.show_next(on_route=True)
+            self._forecaster.smoother.show_next(on_route=True)
         return self._ahead(road, self._costs, free, pack)
 
     def _move(self, now: float, road: Road) -> None:
@@ -192,7 +192,7 @@ class RoadAhead:
                 and abs(conditions.altitude - then.altitude) < CHANGED.altitude
             ):
                 return
-            moving = self._forecaster.riding.time_moving
+            moving = self._forecaster.learner.time_moving
             self._modelling = road.energy.modelled(self._forecaster.load, conditions, moving)
             self._modelled = conditions
         costs = next(self._modelling)
@@ -202,7 +202,7 @@ class RoadAhead:
     def _ahead(self, road: Road, costs: Costs, free: Forecast, pack: Pack) -> Forecast:
         here, end = road.position.along, road.energy.length
         cost, variance = self._cost
-        cost += self._forecaster.beside
+        cost += self._forecaster.learner.auxiliary_factor
         variance = variance / cost**2 + AHEAD_SD**2 + pack.loss_variance
         level = cost * road.energy.between(costs.level, here, end)
         needed = level + road.energy.between(costs.height, here, end)

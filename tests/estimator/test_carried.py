@@ -38,11 +38,11 @@ def test_a_tow_is_known_by_current_or_torque(seen):
     e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for event in roll(600, 0.0, 390.0, seen):
         e.handle(event)
-    before = e.forecaster.riding.usual.price.now
+    before = e.forecaster.learner.habits.price.now
     for event in roll(400, 600.0, 0.0, seen):
         e.handle(event)
-    assert e.forecaster.riding.towed
-    assert e.forecaster.riding.usual.price.now == pytest.approx(before, rel=0.02)
+    assert e.forecaster.learner.towed
+    assert e.forecaster.learner.habits.price.now == pytest.approx(before, rel=0.02)
 
 
 WITNESSES = {
@@ -68,11 +68,11 @@ def stand(seconds: float, start: float, van: float, own: tuple[float, ...]) -> I
 def test_a_scooter_in_a_van_is_parked(witness):
     own = WITNESSES[witness]
     e = Estimator([PACK, own, GPS], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
-    riding = e.forecaster.riding
+    learner = e.forecaster.learner
     rest = (1234000.0,) if witness == "odometer" else (0.0, 0.0)
     for event in stand(180, 0.0, 0.0, rest[: len(own.roles)]):
         e.handle(event)
-    before = riding.usual, e.road.distance
+    before = learner.habits, e.road.distance
     seen = set()
     for event in stand(1200, 180.0, 15.0, rest[: len(own.roles)]):
         e.handle(event)
@@ -80,7 +80,7 @@ def test_a_scooter_in_a_van_is_parked(witness):
     estimate = e.estimate(event[0])
     assert estimate.activity is Activity.PARKED
     assert not estimate.distrusted
-    assert riding.usual == before[0]
+    assert learner.habits == before[0]
     if witness != "odometer":  # which shows it only after its longest step
         assert seen == {(Activity.PARKED, ())}
         assert e.road.distance == before[1]

@@ -51,7 +51,7 @@ def test_a_seldom_speed_does_not_make_the_riding_cheaper():
                     continue
                 last = event[0]
             e.handle(event)
-        factors.append(e.forecaster.riding.factor)
+        factors.append(e.forecaster.learner.factor)
     assert factors[1] == pytest.approx(factors[0], rel=0.04)
 
 
