@@ -22,7 +22,7 @@ from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
-from gz_onboard.estimator.consumption import CONSUMPTION, Habits, Quantity, Terrain
+from gz_onboard.estimator.consumption import Habits, Quantity
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part, unlike
@@ -42,10 +42,7 @@ MEANING = {  # by name: what its factor is on
     "stops": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": f"how far {CONSUMPTION.stretch_m / 1000:.0f} km of road end above or below their begin, whoever rides, "
-    f"over the {sqrt(CONSUMPTION.stretch_m * CONSUMPTION.terrain_rate):.0f} m expected before the first ride",
 }
-TERRAIN = "terrain"
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
 ANEW = "; to begin anew, give `gz-onboard estimate --state` a new name; the daemon does so by itself when it starts"
 BY_RESISTANCE = "; what the resistance tells of it stays: `--reset battery` forgets both"
@@ -60,7 +57,7 @@ PARTS = {  # what --reset says of each
     "capacity": "capacity of the battery",
     "resistance": "resistance of the battery",
     "weakest": "weakest group of cells",
-    RIDING: "riding of all riders, and terrain",
+    RIDING: "riding of all riders",
 }
 LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
 
@@ -111,11 +108,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def learned_text(learned: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
-    """For a terminal. Terrain belongs to the roads; an unknown rider is left out if nothing is known of him."""
+    """For a terminal; an unknown rider is left out if nothing is known of his riding."""
     lines = [LEARNED, *(_line(name, x) for name, x in learned.items())]
-    lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]
-    for rider, found in riders.items():
-        habits = {name: x for name, x in found.items() if name != TERRAIN}
+    for rider, habits in riders.items():
         if len(riders) > 1:
             if not rider and not any(x.share for x in habits.values()):
                 continue
@@ -148,9 +143,7 @@ def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict
     with part(RIDING):
         forecaster.restore(snapshot["riding"])
     riders = {learner.rider: learner.habits, **learner.other_riders}
-    found = {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
-    found[learner.rider][TERRAIN] = _of_terrain(learner.state.terrain)
-    return found
+    return {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
 
 
 def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
@@ -161,11 +154,6 @@ def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
 def _of_quantity(quantity: Quantity, prior: Quantity) -> Learned:
     sd, unknown = sqrt(quantity.level_variance), sqrt(prior.level_variance)
     return Learned(quantity.level / prior.level, sd / prior.level, max(1 - sd / unknown, 0.0))
-
-
-def _of_terrain(terrain: Terrain) -> Learned:
-    factor = sqrt(terrain.rate / CONSUMPTION.terrain_rate)
-    return Learned(factor, terrain.relative_sd * factor, terrain.share)
 
 
 def _fresh(vehicle: Vehicle) -> Forecaster:

@@ -317,16 +317,6 @@ class Terrain:
         prior = weight * CONSUMPTION.terrain_rate * stretch
         return (prior + self.squares) / ((weight + self.stretches) * stretch)
 
-    @property
-    def share(self) -> float:
-        """Weight of the roads ridden in `rate`: 0 to 1; the rest is the prior's."""
-        return self.stretches / (CONSUMPTION.terrain_weight + self.stretches)
-
-    @property
-    def relative_sd(self) -> float:
-        """Of the height's sd, as that of so many normal numbers is known."""
-        return 1 / sqrt(2 * (CONSUMPTION.terrain_weight + self.stretches))
-
     def ridden(self, way: float, climb: float, unseen: float) -> Terrain:
         """After `way` [m] that climbed by `climb` [m], except for `unseen` [m] of it without a known grade."""
         stretch = CONSUMPTION.stretch_m
@@ -569,7 +559,8 @@ class ConsumptionLearner:
         segment.climb += second.climb
         segment.unseen += second.unseen
         segment.distance += abs(second.distance)
-        self.pattern.add(second, mean, acceleration, inputs.lateral_acceleration if inputs else None)
+        motion = mean, acceleration, inputs.lateral_acceleration if inputs else None
+        self.pattern.add(second.seconds, motion, second.distance, second.climb)
         self._second = Second(start_speed=speed)
         if segment.distance < c.segment_m:
             return False

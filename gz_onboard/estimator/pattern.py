@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, field
 from math import sqrt
-from typing import Protocol
 
 from gz_onboard.physics.effect import MOVING
 
@@ -18,14 +17,6 @@ ACCELERATIONS = -0.8, -0.2, 0.2, 0.8  # m/s²: between the bins; braking, coasti
 STEEPEST = 0.3  # sine: no road is steeper
 MOST_BINS = 200  # in a saved state: more than any speed has
 _STANDING = -1, 0
-
-
-class Ridden(Protocol):
-    """Sums over a second of riding, as in `consumption.Second`."""
-
-    seconds: float
-    distance: float  # m
-    climb: float  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,24 +65,28 @@ class Pattern:
 
     bins: dict[tuple[int, int], Bin] = field(default_factory=dict)
 
-    def add(self, second: Ridden, speed: float, acceleration: float, lateral: float | None) -> None:
-        """Take in a second at a mean `speed` [m/s], `acceleration` and `lateral` acceleration [m/s²]."""
+    def add(self, dt: float, motion: tuple[float, float, float | None], distance: float, climb: float) -> None:
+        """Take in `dt` [s] of riding, `distance` and `climb` [m].
+
+        motion: mean speed [m/s], acceleration and lateral acceleration [m/s²], the last None if unknown.
+        """
+        speed, acceleration, lateral = motion
         key = _STANDING
         if speed > MOVING:
             key = cruise_of(speed), sum(acceleration > edge for edge in ACCELERATIONS)
         b = self.bins.setdefault(key, Bin())
-        distance = max(second.distance, 0.0)
-        b.time += second.seconds
+        distance = max(distance, 0.0)
+        b.time += dt
         b.distance += distance
         b.cubes += speed * speed * distance
-        b.gained += acceleration * second.seconds
+        b.gained += acceleration * dt
         if distance:
-            grade = min(max(second.climb / distance, -STEEPEST), STEEPEST)
+            grade = min(max(climb / distance, -STEEPEST), STEEPEST)
             b.climb += grade * distance
             b.hills += grade * grade * distance
         if lateral is not None:
-            b.lateral += lateral * lateral * second.seconds
-            b.lateral_time += second.seconds
+            b.lateral += lateral * lateral * dt
+            b.lateral_time += dt
 
     def fade(self, share: float) -> None:
         """Weight all down to `share`."""
