@@ -122,7 +122,7 @@ def judge(file: Path, vehicle_file: Path) -> Trip:
         soc_start=errors[0][0],
         soc_rms=_rms(error[0] for error in errors),
         shown_rms=_rms(error[1] for error in errors),
-        modelled=sums.modelled / sums.moving - 1,
+        modelled=sums.modelled / sums.measured - 1,
         at=car.distance[row] / car.distance[-1],
         ours=energy / e.consumption_expected / way - 1,
         rule=car.distance[row] / (car.soc[row] - car.soc[0]) * charge / way - 1,

@@ -1,17 +1,16 @@
 """Consumption of the riding: what a metre costs and how long it takes, learned for each rider.
 
-The riding is gathered by the second, and the seconds in segments of 250 m. Of each segment the pack's energy is
-compared with the forward model's, which gives four quantities (`Habits`). The first three are relative to the prior
-riding of the vehicle file in the same air, so that cold air or a high pass is not taken for a habit:
+The riding is gathered by the second, and the seconds, with those at stops, in segments of 250 m. Of each segment the
+pack's energy is compared with the forward model's, which gives three quantities (`Habits`). The first two are relative
+to the prior riding of the vehicle file in the same air, so that cold air or a high pass is not taken for a habit:
 
-- price: energy per metre in motion, less what height and speed have stored;
-- stops: energy per metre at stops, in units of that price;
-- pace: time per metre, stops included;
-- factor: measured over modelled energy of the same motion, which is what the parameters have wrong.
+- price: energy per metre, less what height and speed have stored;
+- pace: time per metre;
+- factor: measured over modelled energy of the same motion, the error of the parameters.
 
 Each is one Kalman filter of a slow level and a faster deviation (`Quantity`). The price to expect, and the variance of
 its mean over the way ahead, follow from the filters' states. Power of auxiliaries is measured once, here, where a
-sensor shows it, and is kept out of all four: it is watts, and no price of a metre.
+sensor shows it, and is kept out of all three: it is watts, and no price of a metre.
 """
 
 from __future__ import annotations
@@ -52,22 +51,17 @@ class ConsumptionConfig:
     driving_force: float = 0.003  # of the weight: a motor that takes less does not drive; tyres take thrice that
     height_error_m: float = 3.0  # error of a climb that may explain how a vehicle moves without its motor
     # Filters
-    fade_m: float = 200_000.0  # correlation length of a ride's deviation; full discharges of 50 to 70 km showed none
-    season_sd_per_sqrt_m: float = 1.4e-4  # random walk of the level: a tenth in 500 km (tyres, clothes, ways)
-    scatter_m: float = 20_000.0  # riding from which the scatter is known
+    fade_m: float = 50_000.0  # correlation length of a ride's deviation: 25 to 100 km err alike on 15 full discharges
+    walk_per_sqrt_m: float = 2.2e-4  # random walk of the level: a tenth in 200 km (tyres, clothes, seasons)
     ride_share: float = 0.1  # weight of one ride in the variance from ride to ride: about the last ten count
     least_sd: float = 0.005  # no riding is more even
     outlier_sd: float = 4.0  # a segment that differs by more is a faulty sensor or a wait for a ferry, and is clipped
-    change_m: float = 4000.0  # residuals are averaged over this to detect that the riding has changed
-    change_sd: float = 0.7  # of one segment: 3.9 sd of that mean; none of 24 simulated rides of healthy scooters had it
-    most_correlation: float = 0.8  # between the scatter of neighbouring segments
     most: float = 10.0  # of any quantity; all are about 1, and a heated van in a jam takes 5 times what the model says
     most_variance: float = 4.0
     doubt: float = 1.25  # sd over the change that a faulty sensor taught: price and stops may err alike
     # Priors: sd of the level, from ride to ride, and of a segment
     level_sd: float = 0.15  # price of riders and roads of one kind of vehicle
     price_scatter: float = 0.2 / DRIFT  # sd of a segment's price over that of rides
-    stops_sd: tuple[float, float, float] = (0.03, 0.01, 0.06)  # a wait of half a minute is 0.05 of the price
     pace_sd: tuple[float, float, float] = (0.25, 0.1, 0.4)
     factor_sd: tuple[float, float] = (0.03, 0.18)  # wind, tyres, luggage; a segment's, of eight commissioning rides
     # Forecast of the riding
@@ -92,12 +86,11 @@ CONSUMPTION = ConsumptionConfig()
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A quantity of the riding: Kalman filter of a slow level and the deviation of the present ride from it.
+    """A quantity of the riding: Kalman filter of a slow level and a faster deviation of the present ride from it.
 
-    The level is a random walk over metres, the deviation a first-order Gauss-Markov process that begins with each ride,
-    and a segment shows their sum with a scatter that is correlated between neighbours. The variances of scatter and
-    deviation, and that correlation, are learned by a step of expectation and maximisation with each segment or ride
-    (Shumway & Stoffer 1982).
+    The level is a random walk over metres, the deviation a first-order Gauss-Markov process (Ornstein-Uhlenbeck) that
+    begins with each ride, and a segment shows their sum with white scatter. The variance of the deviation is learned by
+    a step of expectation and maximisation with each ride (Shumway & Stoffer 1982).
     """
 
     level: float
@@ -107,9 +100,6 @@ class Quantity:
     deviation: float = 0.0
     deviation_variance: float = -1.0  # negative: as from ride to ride
     covariance: float = 0.0  # of level and deviation
-    mean_residual: float = 0.0  # of the latest segments, each over its sd
-    correlation: float = 0.0  # between the scatter of neighbouring segments
-    last_residual: float = 0.0  # over its sd, less that mean; 0: of another ride
 
     def __post_init__(self) -> None:
         if self.deviation_variance < 0:
@@ -128,50 +118,29 @@ class Quantity:
     @property
     def known_from(self) -> float:
         """Riding [m] whose mean alone would have the variance of `now`."""
-        return self._mean_variance(1.0) / max(self.variance, 1e-6)
-
-    def _mean_variance(self, distance: float) -> float:
-        """Variance of the mean of the scatter over `distance` [m], a first-order autoregressive process."""
-        return self.scatter * (1 + self.correlation) / (1 - self.correlation) * CONSUMPTION.segment_m / distance
+        return self.scatter * CONSUMPTION.segment_m / max(self.variance, 1e-6)
 
     def learned(self, residual: float, distance: float, noise: float = 0.0) -> Quantity:
         """State after `distance` [m] that differed from `now` by `residual`; noise: a variance besides the scatter."""
         c = CONSUMPTION
         fade = exp(-distance / c.fade_m)
-        walk = (c.season_sd_per_sqrt_m * self.level) ** 2 * distance
+        walk = (c.walk_per_sqrt_m * self.level) ** 2 * distance
         level = min(self.level_variance + walk, max(self.level_variance, c.most_variance))
         both = fade * self.covariance
         own = fade * fade * self.deviation_variance + (1 - fade * fade) * self.ride_variance
-        alone, scatter = self.scatter * c.segment_m / distance, self._mean_variance(distance)
+        scatter = self.scatter * c.segment_m / distance
         total = level + 2 * both + own + scatter + noise
         most = c.outlier_sd * sqrt(total)
         residual = min(max(residual + (1 - fade) * self.deviation, -most), most)
-        clear = noise < scatter  # other errors may last for long and look like a change
-        share = min(distance / c.change_m, 1.0) if clear else 0.0
-        mean_residual = self.mean_residual + share * (residual / sqrt(total) - self.mean_residual)
-        last_residual = residual / sqrt(total) - self.mean_residual
-        if abs(mean_residual) > c.change_sd:  # the riding has changed by about that, or its level was never this
-            change = max(min(max(self.ride_variance, mean_residual**2 * total), c.most_variance) - own, 0.0)
-            of_level = level / (level + self.ride_variance)
-            level, own, mean_residual = level + of_level * change, own + (1 - of_level) * change, 0.0
-            total = level + 2 * both + own + scatter + noise
         gain, own_gain = (level + both) / total, (both + own) / total
-        whole = total - scatter + alone
-        seen = ((alone * residual / whole) ** 2 + alone * (1 - alone / whole)) * distance / c.segment_m
-        share = min(distance / c.scatter_m, 1.0)
-        likeness = share * (scatter / total) ** 2 if clear and self.last_residual else 0.0
-        product = last_residual * self.last_residual * total / alone
         return Quantity(
             min(max(self.level + gain * residual, -c.most), c.most),
             level - gain * (level + both),
             self.ride_variance,
-            min(max(self.scatter + share * (seen - self.scatter), c.least_sd**2), c.most_variance),
+            self.scatter,
             min(max(fade * self.deviation + own_gain * residual, -c.most), c.most),
             own - own_gain * (both + own),
             both - gain * (both + own),
-            mean_residual,
-            min(max(self.correlation + likeness * (product - self.correlation), 0.0), c.most_correlation),
-            last_residual,
         )
 
     def ahead(self, distance: float) -> tuple[float, float]:
@@ -180,7 +149,7 @@ class Quantity:
         share = (1 - exp(-lengths)) / lengths
         unknown = 2 * (1 - share) / lengths - share * share  # of the ride's variance
         variance = self.level_variance + 2 * share * self.covariance + share * share * self.deviation_variance
-        variance += unknown * self.ride_variance + self._mean_variance(max(distance, CONSUMPTION.segment_m))
+        variance += unknown * self.ride_variance + self.scatter * min(CONSUMPTION.segment_m / max(distance, 1.0), 1.0)
         return self.level + share * self.deviation, variance
 
     def next_ride(self) -> Quantity:
@@ -189,7 +158,7 @@ class Quantity:
         seen = self.deviation**2 + self.deviation_variance
         ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
         ride_variance = min(max(ride_variance, c.least_sd**2), c.most_variance)
-        return Quantity(self.level, self.level_variance, ride_variance, self.scatter, correlation=self.correlation)
+        return Quantity(self.level, self.level_variance, ride_variance, self.scatter)
 
     def doubted(self, seen: float) -> Quantity:
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
@@ -215,13 +184,12 @@ class Habits:
     """Riding of one rider. All but the factor are in units of the prior riding."""
 
     price: Quantity
-    stops: Quantity
     pace: Quantity
     factor: Quantity
 
     @classmethod
-    def before(cls, prior: PriorRiding, stops: float) -> Habits:
-        """Before anything is ridden; stops: of the prior riding."""
+    def before(cls, prior: PriorRiding) -> Habits:
+        """Before anything is ridden."""
         c = CONSUMPTION
 
         def quantity(level: float, sd: float, ride_sd: float, scatter_sd: float) -> Quantity:
@@ -230,7 +198,6 @@ class Habits:
         scatter = max(c.price_scatter * prior.drift, c.least_sd)
         return cls(
             quantity(prior.factor, sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, scatter),
-            quantity(stops, *c.stops_sd),
             quantity(1.0, *c.pace_sd),
             quantity(prior.factor, prior.factor_sd, *c.factor_sd),
         )
@@ -245,14 +212,12 @@ class Habits:
 
     def scaled(self, price: float, pace: float) -> Habits:
         """In units of a prior riding whose price and pace are so many times smaller."""
-        return Habits(
-            self.price.scaled(price), self.stops.scaled(price), self.pace.scaled(pace), self.factor.scaled(price)
-        )
+        return Habits(self.price.scaled(price), self.pace.scaled(pace), self.factor.scaled(price))
 
     @property
-    def all(self) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+    def all(self) -> tuple[Quantity, Quantity, Quantity]:
         """In the order of the fields."""
-        return self.price, self.stops, self.pace, self.factor
+        return self.price, self.pace, self.factor
 
 
 @dataclass(slots=True)
@@ -261,19 +226,18 @@ class Segment:
 
     distance: float = 0.0  # m
     duration: float = 0.0  # s
-    moving: float = 0.0  # J, measured in motion
-    stops: float = 0.0  # J, measured at stops
+    measured: float = 0.0  # J
     auxiliary: float = 0.0  # J, of auxiliaries beyond the file's
     squares: float = 0.0  # W²·s, of the measured power
-    modelled: float = 0.0  # J, in motion
+    modelled: float = 0.0  # J
     level: float = 0.0  # J, modelled, less what height and speed have stored
     unseen: float = 0.0  # m of which no sensor showed the grade
     climb: float = 0.0  # m, of the rest
 
     @property
     def energy(self) -> float:
-        """All that was measured [J]."""
-        return self.moving + self.stops + self.auxiliary
+        """Measured with those auxiliaries [J]."""
+        return self.measured + self.auxiliary
 
     def faded(self, segment: Segment, memory: float) -> Segment:
         """These sums, weighted down over a `memory` [m], with those of a `segment` that came after."""
@@ -405,9 +369,8 @@ class ConsumptionLearner:
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.load = LoadModel(model, battery, prior)
-        price, stops = self.load.prior_prices(*USUAL_AIR)
-        self.prior_price = price + stops  # J/m: with the prior's speed, the unit of saved habits
-        self.prior = Habits.before(prior, stops / price)
+        self.prior_price = self.load.prior_price(*USUAL_AIR)  # J/m: with the prior's speed, the unit of saved habits
+        self.prior = Habits.before(prior)
         self.state = RidingState(self.prior)
         self.pattern, self.auxiliaries = Pattern(), AuxiliaryPower(model)
         self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
@@ -461,7 +424,7 @@ class ConsumptionLearner:
         """Measured over modelled energy of about the last kilometre; 1 while that is not known."""
         recent = self.state.recent
         known = self.state.sums.distance >= CONSUMPTION.recent_m and recent.modelled > 0
-        return recent.moving / recent.modelled if known else 1.0
+        return recent.measured / recent.modelled if known else 1.0
 
     @property
     def recent_consumption(self) -> float | None:
@@ -479,30 +442,29 @@ class ConsumptionLearner:
     def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
         """The riding on the next `way` [m]; ambient in degC, altitude in m."""
         c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed
-        moving, standing = self.load.prior_prices(ambient, altitude)
+        unit = self.load.prior_price(ambient, altitude)
         price, price_variance = habits.price.ahead(way)
-        stops, stops_variance = habits.stops.ahead(way)
         pace, pace_variance = habits.pace.ahead(way)
         price, pace = max(price, c.least_price), max(pace, c.least_price)
         extra = self.auxiliaries.mean / speed  # J/m, at the prior's pace
-        consumption = moving * (price + max(stops, 0.0)) + extra * pace
+        consumption = unit * price + extra * pace
         # Where no grade was seen the price is the model's times the factor, whose error is the same all the way.
         unseen = sums.unseen / sums.distance if sums.distance else 0.0
         price_variance += (unseen * price / self.factor) ** 2 * habits.factor.variance
         height_variance = self._weight**2 * self.state.terrain.variance(way) / (consumption * way) ** 2
-        prior_power, prior_time = (moving + standing) * speed, c.prior_m / speed
+        prior_power, prior_time = unit * speed, c.prior_m / speed
         # Downhill next to nothing is drawn in the mean; the way to come is not all downhill.
         energy = prior_power * prior_time + max(sums.energy, self.consumption_factor * sums.level)
         energy = max(energy, c.least_price * prior_power * prior_time)
         squares = c.form_factor_squared * prior_power**2 * prior_time + sums.squares
         low, high = c.form_factor_squared_limits
-        variance = ((price_variance + stops_variance) * moving**2 + pace_variance * extra**2) / consumption**2
+        variance = (price_variance * unit**2 + pace_variance * extra**2) / consumption**2
         return ExpectedRiding(
             consumption,
             consumption * speed / pace,
             min(max(squares * (prior_time + sums.duration) / energy**2, low), high),
             variance + height_variance,
-            least=c.least_price * moving,
+            least=c.least_price * unit,
         )
 
     # --- learning -----------------------------------------------------------------------------------------------
@@ -545,13 +507,12 @@ class ConsumptionLearner:
             self.load.ledger.measured += second.energy
         if moving:
             self.still = 0.0
-            segment.moving += second.energy - auxiliary
-            segment.modelled += modelled
-            segment.level += repeated
         else:
             self._stand(second.seconds)
         if self.still <= STOP_TIME:  # a longer stop takes energy, but teaches nothing
-            segment.stops += 0.0 if moving else second.energy - auxiliary
+            segment.measured += second.energy - auxiliary
+            segment.modelled += modelled
+            segment.level += repeated
             segment.auxiliary += auxiliary
             segment.duration += second.seconds
             segment.squares += second.squares
@@ -615,18 +576,17 @@ class ConsumptionLearner:
         """Learn from the segment that has ended."""
         c, segment, state, speed = CONSUMPTION, self._segment, self.state, self.load.prior.speed
         way, habits = segment.distance, state.habits
-        unit = self.load.prior_prices(conditions.ambient, conditions.altitude)[0] * way
+        unit = self.load.prior_price(conditions.ambient, conditions.altitude) * way
         unseen, factor = segment.unseen / way, habits.factor.now
-        paid = (1 - unseen) * (segment.moving - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
+        paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
         # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
         # the grade) would draw the factor to 0. Hills that no sensor showed have stored an unknown energy.
         weight = factor / (max(habits.price.now, c.least_price) * unit)
         height = self._weight * c.height_walk * sqrt(segment.unseen)  # J
         learned = Habits(
-            habits.price.learned(paid / unit - habits.price.now, way, unseen * unseen * habits.factor.variance),
-            habits.stops.learned(segment.stops / unit - habits.stops.now, way),
+            habits.price.learned(paid / unit - habits.price.now, way),
             habits.pace.learned(segment.duration * speed / way - habits.pace.now, way),
-            habits.factor.learned(weight * (segment.moving - factor * segment.modelled), way, (height * weight) ** 2),
+            habits.factor.learned(weight * (segment.measured - factor * segment.modelled), way, (height * weight) ** 2),
         )
         self._history.append((way, state))
         self.state = RidingState(
@@ -746,7 +706,7 @@ def _checked(habits: Habits) -> Habits:
         possible = all(abs(x) <= CONSUMPTION.most for x in astuple(q))
         possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
         possible &= q.covariance**2 <= q.level_variance * q.deviation_variance * (1 + 1e-9)
-        if not (possible and 0 <= q.correlation <= CONSUMPTION.most_correlation):
+        if not possible:
             raise ValueError("implausible habits")
     return habits
 

