@@ -38,7 +38,8 @@ MEANING = {  # by name: what its factor is on
     "weak_charge": "of the weakest group of cells, over the mean cell's, when that is full",
     "weak_capacity": "of that group, over the mean cell's",
     "weak_resistance": "of that group, over the mean cell's",
-    "price": "energy of a kilometre, over the prior riding's in the vehicle file",
+    "price": "energy of a kilometre in motion, over the prior riding's in the vehicle file",
+    "stops": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
 }

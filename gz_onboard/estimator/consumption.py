@@ -1,16 +1,17 @@
 """Consumption of the riding: what a metre costs and how long it takes, learned for each rider.
 
-The riding is gathered by the second, and the seconds, with those at stops, in segments of 250 m. Of each segment the
-pack's energy is compared with the forward model's, which gives three quantities (`Habits`). The first two are relative
-to the prior riding of the vehicle file in the same air, so that cold air or a high pass is not taken for a habit:
+The riding is gathered by the second, and the seconds in segments of 250 m. Of each segment the pack's energy is
+compared with the forward model's, which gives four quantities (`Habits`). The first three are relative to the prior
+riding of the vehicle file in the same air, so that cold air or a high pass is not taken for a habit:
 
-- price: energy per metre, less what height and speed have stored;
-- pace: time per metre;
+- price: energy per metre in motion, less the energy that height and speed have stored;
+- stops: energy per metre at stops, in units of that price; one long wait must not look like expensive riding;
+- pace: time per metre, stops included;
 - factor: measured over modelled energy of the same motion, the error of the parameters.
 
 Each is one Kalman filter of a slow level and a faster deviation (`Quantity`). The price to expect, and the variance of
 its mean over the way ahead, follow from the filters' states. Power of auxiliaries is measured once, here, where a
-sensor shows it, and is kept out of all three: it is watts, and no price of a metre.
+sensor shows it, and is kept out of all four: it is watts, and no price of a metre.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class ConsumptionConfig:
     # Priors: sd of the level, from ride to ride, and of a segment
     level_sd: float = 0.15  # price of riders and roads of one kind of vehicle
     price_scatter: float = 0.2 / DRIFT  # sd of a segment's price over that of rides
+    stops_sd: tuple[float, float, float] = (0.03, 0.01, 0.06)  # a wait of half a minute is 0.05 of the price
     pace_sd: tuple[float, float, float] = (0.25, 0.1, 0.4)
     factor_sd: tuple[float, float] = (0.03, 0.18)  # wind, tyres, luggage; a segment's, of eight commissioning rides
     # Forecast of the riding
@@ -184,12 +186,13 @@ class Habits:
     """Riding of one rider. All but the factor are in units of the prior riding."""
 
     price: Quantity
+    stops: Quantity
     pace: Quantity
     factor: Quantity
 
     @classmethod
-    def before(cls, prior: PriorRiding) -> Habits:
-        """Before anything is ridden."""
+    def before(cls, prior: PriorRiding, stops: float) -> Habits:
+        """Before anything is ridden; stops: of the prior riding."""
         c = CONSUMPTION
 
         def quantity(level: float, sd: float, ride_sd: float, scatter_sd: float) -> Quantity:
@@ -198,6 +201,7 @@ class Habits:
         scatter = max(c.price_scatter * prior.drift, c.least_sd)
         return cls(
             quantity(prior.factor, sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, scatter),
+            quantity(stops, *c.stops_sd),
             quantity(1.0, *c.pace_sd),
             quantity(prior.factor, prior.factor_sd, *c.factor_sd),
         )
@@ -212,12 +216,14 @@ class Habits:
 
     def scaled(self, price: float, pace: float) -> Habits:
         """In units of a prior riding whose price and pace are so many times smaller."""
-        return Habits(self.price.scaled(price), self.pace.scaled(pace), self.factor.scaled(price))
+        return Habits(
+            self.price.scaled(price), self.stops.scaled(price), self.pace.scaled(pace), self.factor.scaled(price)
+        )
 
     @property
-    def all(self) -> tuple[Quantity, Quantity, Quantity]:
+    def all(self) -> tuple[Quantity, Quantity, Quantity, Quantity]:
         """In the order of the fields."""
-        return self.price, self.pace, self.factor
+        return self.price, self.stops, self.pace, self.factor
 
 
 @dataclass(slots=True)
@@ -226,18 +232,19 @@ class Segment:
 
     distance: float = 0.0  # m
     duration: float = 0.0  # s
-    measured: float = 0.0  # J
+    measured: float = 0.0  # J, in motion
+    stops: float = 0.0  # J, measured at stops
     auxiliary: float = 0.0  # J, of auxiliaries beyond the file's
     squares: float = 0.0  # W²·s, of the measured power
-    modelled: float = 0.0  # J
+    modelled: float = 0.0  # J, in motion
     level: float = 0.0  # J, modelled, less what height and speed have stored
     unseen: float = 0.0  # m of which no sensor showed the grade
     climb: float = 0.0  # m, of the rest
 
     @property
     def energy(self) -> float:
-        """Measured with those auxiliaries [J]."""
-        return self.measured + self.auxiliary
+        """All that was measured, with those auxiliaries [J]."""
+        return self.measured + self.stops + self.auxiliary
 
     def faded(self, segment: Segment, memory: float) -> Segment:
         """These sums, weighted down over a `memory` [m], with those of a `segment` that came after."""
@@ -369,8 +376,9 @@ class ConsumptionLearner:
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.load = LoadModel(model, battery, prior)
-        self.prior_price = self.load.prior_price(*USUAL_AIR)  # J/m: with the prior's speed, the unit of saved habits
-        self.prior = Habits.before(prior)
+        moving, stops = self.load.prior_prices(*USUAL_AIR)
+        self.prior_price = moving + stops  # J/m: with the prior's speed, the unit of saved habits
+        self.prior = Habits.before(prior, stops / moving)
         self.state = RidingState(self.prior)
         self.pattern, self.auxiliaries = Pattern(), AuxiliaryPower(model)
         self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
@@ -442,23 +450,24 @@ class ConsumptionLearner:
     def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
         """The riding on the next `way` [m]; ambient in degC, altitude in m."""
         c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed
-        unit = self.load.prior_price(ambient, altitude)
+        unit, standing = self.load.prior_prices(ambient, altitude)
         price, price_variance = habits.price.ahead(way)
+        stops, stops_variance = habits.stops.ahead(way)
         pace, pace_variance = habits.pace.ahead(way)
         price, pace = max(price, c.least_price), max(pace, c.least_price)
         extra = self.auxiliaries.mean / speed  # J/m, at the prior's pace
-        consumption = unit * price + extra * pace
+        consumption = unit * (price + max(stops, 0.0)) + extra * pace
         # Where no grade was seen the price is the model's times the factor, whose error is the same all the way.
         unseen = sums.unseen / sums.distance if sums.distance else 0.0
         price_variance += (unseen * price / self.factor) ** 2 * habits.factor.variance
         height_variance = self._weight**2 * self.state.terrain.variance(way) / (consumption * way) ** 2
-        prior_power, prior_time = unit * speed, c.prior_m / speed
+        prior_power, prior_time = (unit + standing) * speed, c.prior_m / speed
         # Downhill next to nothing is drawn in the mean; the way to come is not all downhill.
         energy = prior_power * prior_time + max(sums.energy, self.consumption_factor * sums.level)
         energy = max(energy, c.least_price * prior_power * prior_time)
         squares = c.form_factor_squared * prior_power**2 * prior_time + sums.squares
         low, high = c.form_factor_squared_limits
-        variance = (price_variance * unit**2 + pace_variance * extra**2) / consumption**2
+        variance = ((price_variance + stops_variance) * unit**2 + pace_variance * extra**2) / consumption**2
         return ExpectedRiding(
             consumption,
             consumption * speed / pace,
@@ -507,12 +516,13 @@ class ConsumptionLearner:
             self.load.ledger.measured += second.energy
         if moving:
             self.still = 0.0
-        else:
-            self._stand(second.seconds)
-        if self.still <= STOP_TIME:  # a longer stop takes energy, but teaches nothing
             segment.measured += second.energy - auxiliary
             segment.modelled += modelled
             segment.level += repeated
+        else:
+            self._stand(second.seconds)
+        if self.still <= STOP_TIME:  # a longer stop takes energy, but teaches nothing
+            segment.stops += 0.0 if moving else second.energy - auxiliary
             segment.auxiliary += auxiliary
             segment.duration += second.seconds
             segment.squares += second.squares
@@ -576,7 +586,7 @@ class ConsumptionLearner:
         """Learn from the segment that has ended."""
         c, segment, state, speed = CONSUMPTION, self._segment, self.state, self.load.prior.speed
         way, habits = segment.distance, state.habits
-        unit = self.load.prior_price(conditions.ambient, conditions.altitude) * way
+        unit = self.load.prior_prices(conditions.ambient, conditions.altitude)[0] * way
         unseen, factor = segment.unseen / way, habits.factor.now
         paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
         # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
@@ -585,6 +595,7 @@ class ConsumptionLearner:
         height = self._weight * c.height_walk * sqrt(segment.unseen)  # J
         learned = Habits(
             habits.price.learned(paid / unit - habits.price.now, way),
+            habits.stops.learned(segment.stops / unit - habits.stops.now, way),
             habits.pace.learned(segment.duration * speed / way - habits.pace.now, way),
             habits.factor.learned(weight * (segment.measured - factor * segment.modelled), way, (height * weight) ** 2),
         )

@@ -90,7 +90,7 @@ class LoadModel:
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._battery = battery
         self._by_heading = "heading" in model.reads
-        self._prior_power = lru_cache(KEPT_AIRS)(self._prior_power_in)
+        self._prior_prices = lru_cache(KEPT_AIRS)(self._prior_prices_in)
 
     def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
         """Inputs of the base model on a level road without wind; speed [m/s], acceleration [m/s²]."""
@@ -154,22 +154,25 @@ class LoadModel:
 
     def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
         """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
-        return self._prior_power(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)), self.prior.speed
+        return sum(self.prior_prices(ambient, altitude)) * self.prior.speed, self.prior.speed
 
-    def prior_price(self, ambient: float, altitude: float) -> float:
-        """Energy per metre of the prior riding [J/m], stops included; see `prior_ride`."""
-        power, speed = self.prior_ride(ambient, altitude)
-        return power / speed
+    def prior_prices(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """Energy per metre of the prior riding [J/m], in motion and at its stops; see `prior_ride`."""
+        return self._prior_prices(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS))
 
     def usual_force(self) -> float:
         """Mean force [N] of the prior riding: its energy at the pack over its distance."""
-        return self.prior.factor * self.prior_price(*USUAL_AIR)
+        return self.prior.factor * sum(self.prior_prices(*USUAL_AIR))
 
-    def _prior_power_in(self, ambient: float, altitude: float) -> float:
-        power = 0.0
+    def _prior_prices_in(self, ambient: float, altitude: float) -> tuple[float, float]:
+        moving = standing = 0.0
         for share, speed, acceleration in self.prior.points:
             q = self.quantities(speed, acceleration, Conditions(ambient, altitude))
             if self.extended:
                 self.extend(q, EffectInputs(None, None, HALF_FULL, ambient, 0.0), ambient, AHEAD)
-            power += share * self.power_ahead(q) * self.prior.unevenness
-        return power
+            price = share * self.power_ahead(q) * self.prior.unevenness / self.prior.speed
+            if speed > MOVING:
+                moving += price
+            else:
+                standing += price
+        return moving, standing

@@ -48,7 +48,7 @@ def test_a_quantity_learns_how_unlike_rides_are():
 
 
 def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
-    town, car = (Habits.before(PriorRiding(drift=drift)).price for drift in (0.055, 0.22))
+    town, car = (Habits.before(PriorRiding(drift=drift), 0.02).price for drift in (0.055, 0.22))
     assert car.scatter == pytest.approx(16 * town.scatter)
 
 
@@ -91,9 +91,9 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
         quantity = quantity.learned(residual, distance, noise)
         if i % 7 == 6:
             quantity = quantity.next_ride()
-    prior = Habits.before(PriorRiding())
+    prior = Habits.before(PriorRiding(), 0.02)
     learner = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
-    learner.state = replace(learner.state, habits=Habits(quantity, prior.pace, quantity))
+    learner.state = replace(learner.state, habits=Habits(quantity, prior.stops, prior.pace, quantity))
     again = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
     again.restore(json.loads(json.dumps(learner.snapshot())))
     assert again.habits == learner.habits
