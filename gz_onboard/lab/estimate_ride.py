@@ -27,7 +27,6 @@ from gz_onboard.progress import Progress
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-TICK_S = TICK_NS * 1e-9
 IDENTIFIED_WITHIN = 60.0  # s from the first frame
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile
@@ -143,9 +142,10 @@ def _identified(vehicle: Vehicle, batches: Iterator[list[Frame]], where: str) ->
     read: list[list[Frame]] = []
     while sources and codec.seconds(codec.last_ns) < IDENTIFIED_WITHIN and (batch := next(batches, None)):
         read.append(batch)
-        for _, _, (value, *_) in codec.decode(batch):
-            if value is not None:
-                vehicle, sources = vehicle.identified(f"{value:.0f}", where), ()
+        codec.decode(batch)
+        for window in codec.windows():
+            if number := window.roles[0]:
+                vehicle, sources = vehicle.identified(f"{number.value:.0f}", where), ()
     return vehicle, chain(read, batches)
 
 

@@ -16,7 +16,7 @@ from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError, brief, nearest, shown
-from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, Event, Frame, hexadecimal
+from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, Frame, hexadecimal
 from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.options import MOST_PAYLOAD
@@ -111,9 +111,8 @@ def read_roles(
     vehicle: Vehicle,
     source: tuple[Codec, Iterable[list[Frame]]],
     progress: Callable[[int], None] | None = None,
-    observe: Callable[[Event], None] | None = None,
 ) -> dict[str, tuple[Array, Array]]:
-    """(times [s], values) by role of all that is decoded in `log` more than once; `observe` gets every event.
+    """(times [s], values) by role of all that is decoded in `log` more than once.
 
     source: the codec and the frames of the log. progress: called with the number of frames read. Raises InputError for
     a log that cannot be read or is not of the vehicle.
@@ -124,14 +123,13 @@ def read_roles(
     found: dict[str, tuple[list[float], list[float]]] = {}
     slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
     for batch, count in without_lone(frames, codec.odd):
-        for event in codec.decode(batch):
-            time, group, values = event
-            for (times, column), value in zip(slots[group], values, strict=True):
-                if value is not None:
-                    times.append(time)
-                    column.append(value)
-            if observe:
-                observe(event)
+        for frame in batch:
+            codec.decode((frame,))
+            for window in codec.windows():
+                for (times, column), sample in zip(slots[window.group], window.roles, strict=True):
+                    if sample is not None:
+                        times.append(sample.time)
+                        column.append(sample.value)
         if progress:
             progress(count)
     check_ridden(log, vehicle, codec)
