@@ -440,3 +440,15 @@ def test_tyres_are_cold_again_after_an_hour():
     assert f.learner.time_moving == 900.0
     f.learner.pause(1800.0)
     assert f.learner.time_moving == 0.0
+
+
+def test_a_forecast_each_second_equals_one_from_nothing():
+    """The discharge is computed again only now and then: SOC, cells, air and load move on in between."""
+    f, errors, energies = forecaster(), [], []
+    for second in range(0, 1800, 3):
+        at = 0.7 - second * 1e-4, 0.01, 15.0 + second * 2e-3, 1.0, 12.0 + second * 1e-3, 0.0
+        now, anew = f.forecast(*at), forecaster().forecast(*at)
+        errors.append(now.energy / anew.energy - 1)
+        energies.append(now.energy)
+    assert np.abs(errors).max() < 1e-3
+    assert np.diff(energies).max() < 2e-4 * energies[0]
