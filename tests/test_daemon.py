@@ -270,7 +270,7 @@ def without_numbers(snapshot: Snapshot) -> None:
 
 
 def without_states(snapshot: Snapshot) -> None:
-    snapshot["riding"]["states"] = None
+    snapshot["riding"]["effects"] = None
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.estimator.consumption import Habits, Quantity
 from gz_onboard.estimator.forecast import Forecaster, RangeSmoother
+from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.physics.riding import PriorRiding
 from gz_onboard.vehicle import read_vehicle
 
@@ -99,3 +100,63 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
     assert again.habits == learner.habits
     assert quantity.ahead(10_000.0)[1] >= 0
     assert quantity.variance >= 0
+
+
+AIR = Conditions(20.0, 0.0)
+
+
+def steady(learner, metres, power, speed=10.0, grade=0.0):
+    """Riding at constant `power` [W]."""
+    for _ in range(round(metres / speed)):
+        learner.ride(1.0, speed, grade, power, AIR)
+
+
+def fresh():
+    return Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
+
+
+def test_recent_consumption_is_that_of_about_the_last_kilometre():
+    learner = fresh()
+    steady(learner, 390, 500.0)
+    assert learner.recent_consumption is None
+    steady(learner, 5000, 500.0)
+    assert learner.recent_consumption == pytest.approx(50.0)
+    steady(learner, 1000, 900.0)
+    assert learner.recent_consumption == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
+
+
+def test_bursts_are_expected_from_about_the_last_twelve_kilometres():
+    """To twice the mean power, then none."""
+    learner = fresh()
+    for _ in range(200):
+        steady(learner, 100, 1000.0)
+        steady(learner, 100, 0.0)
+    bursts = learner.expected(30e3, 20.0, 0.0).form_factor_squared
+    assert learner.state.sums.distance == pytest.approx(12_000, rel=0.05)
+    steady(learner, 24_000, 500.0)
+    even = learner.expected(30e3, 20.0, 0.0).form_factor_squared
+    assert 2.0 < bursts < 2.4
+    assert even < bursts - 0.5
+
+
+def test_before_much_is_ridden_bursts_are_those_of_the_prior_riding():
+    learner = fresh()
+    assert learner.expected(30e3, 20.0, 0.0).form_factor_squared == pytest.approx(2.5)
+    steady(learner, 3000, 800.0)
+    assert 1.5 < learner.expected(30e3, 20.0, 0.0).form_factor_squared < 2.0
+    assert not learner.mostly_prior or learner.state.sums.distance < 3000
+
+
+@pytest.mark.parametrize(("change", "taken"), [(10.0, True), (20.0, False)])
+def test_a_second_that_accelerates_as_no_road_allows_is_left_out(change, taken):
+    learner = fresh()
+    steady(learner, 100, 500.0)
+    before = learner._segment.distance
+    learner.ride(1.0, 10.0 + change, 0.0, 500.0, AIR)
+    assert (learner._segment.distance > before) == taken
+
+
+def test_a_segment_that_no_riding_explains_counts_for_little():
+    """A ferry queue that costs a hundred times the price moves it by a tenth."""
+    quantity = Quantity(1.0, 0.05**2, 0.055**2, 0.2**2)
+    assert 0.07 < quantity.learned(100.0, 250.0).now - 1 < 0.15

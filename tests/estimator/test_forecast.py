@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gz_onboard.estimator import forecast as forecast_module
 from gz_onboard.estimator.consumption import ExpectedRiding
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions
@@ -442,9 +443,10 @@ def test_tyres_are_cold_again_after_an_hour():
     assert f.learner.time_moving == 0.0
 
 
-def test_a_forecast_each_second_equals_one_from_nothing():
+def test_a_forecast_each_second_equals_one_from_nothing(monkeypatch):
     """The discharge is computed again only now and then: SOC, cells, air and load move on in between."""
-    f, errors, energies = forecaster(), [], []
+    f, errors, energies, computed = forecaster(), [], [], []
+    monkeypatch.setattr(forecast_module, "cells_ahead", lambda *x: computed.append(x) or cells_ahead(*x))
     for second in range(0, 1800, 3):
         at = 0.7 - second * 1e-4, 0.01, 15.0 + second * 2e-3, 1.0, 12.0 + second * 1e-3, 0.0
         now, anew = f.forecast(*at), forecaster().forecast(*at)
@@ -452,3 +454,9 @@ def test_a_forecast_each_second_equals_one_from_nothing():
         energies.append(now.energy)
     assert np.abs(errors).max() < 1e-3
     assert np.diff(energies).max() < 2e-4 * energies[0]
+    assert len(computed) - len(errors) < len(errors) / 5
+
+
+def test_a_consumption_of_which_nothing_is_known_has_a_finite_interval():
+    result = forecaster().forecast(0.7, 0.0, 25.0, 0.0, 20.0, 0.0, loss_variance=25.0)
+    assert np.log(result.range / result.p10) == pytest.approx(1.28, rel=0.05)

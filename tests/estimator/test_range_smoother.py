@@ -227,3 +227,11 @@ def test_a_first_guess_that_was_too_good_is_left_as_soon_as_the_riding_is_known(
         found.append(smoother.follow(raw, 4e6, so_far, 10.0) / raw)
     assert found[150] > 1.1
     assert found[-1] < 1.1
+
+
+def test_noise_of_a_speed_sensor_at_standstill_is_no_riding():
+    """A forecast that falls by 2 % while the sensor twitches: the display waits."""
+    smoother = RangeSmoother()
+    for raw in np.linspace(40_000, 39_200, 2000):
+        found = smoother.follow(raw, 1e6, 500.0, 0.08, 0.0)
+    assert found == pytest.approx(40_000)
