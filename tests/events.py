@@ -46,8 +46,8 @@ class EventEstimator(Estimator):
     def estimate(self, now: float) -> Estimate:
         """See `Estimator`."""
         if getattr(self, "_open", None):
-            self.close(now)
-            self._end = now
+            self._end = min(now, self._end)
+            self.close(self._end)
         return super().estimate(now)
 
     @staticmethod

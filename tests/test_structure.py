@@ -46,8 +46,8 @@ FORBIDDEN = {
 
 OFFLINE = ("offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
-# Imported only when asked for, or for types: the reference filter behind --filter filterpy, arrays.
-ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
+# Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
+ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py", "bridges/broker.py"}
 
 # The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
 # that stand before it.
@@ -144,6 +144,16 @@ def test_the_daemon_loads_nothing_heavy(name):
     loaded = set(run.stdout.split())
     assert "gz_onboard" in loaded
     assert not HEAVY & loaded
+
+
+def test_the_daemon_starts_light():
+    """Without numpy, and on SocketCAN without python-can, which costs 9 MB."""
+    code = (
+        "import sys; from gz_onboard.daemon import command; from gz_onboard.vehicle import read_vehicle;"
+        "from gz_onboard.pipeline import Pipeline; Pipeline(read_vehicle('reference')); print(*sys.modules)"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"numpy", "scipy", "can", "asyncio", "ssl"} & set(loaded)
 
 
 def test_the_api_is_loaded_only_when_asked_for():

@@ -97,7 +97,7 @@ def _going_on(
     with held(file):
         at = state_at(file, source, span_of(source, vehicle))
         ridden = ride_through(open_estimate(source, vehicle), replace(how, state=at), log, progress)
-        if ridden.went_on and (text := text_of(ridden.pipeline, ridden.went_on)):
+        if ridden.went_on and (text := text_of(ridden.pipeline)):
             with writing(file):
                 saved_state.write(file, text)
     return ridden

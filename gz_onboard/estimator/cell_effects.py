@@ -67,11 +67,10 @@ class CellEffects:
         return after
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
-        """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""
-        states = {name: float(saved[name]) for name in self.states}
-        if not all(abs(x) < LARGEST for x in states.values()):
-            raise ValueError("holds implausible voltages of effects in the cells")
-        return states
+        """Saved states, which were checked. ValueError if they are not of these effects."""
+        if saved.keys() != self.states.keys():
+            raise ValueError("is damaged: state.cell_effects has not the effects of this vehicle")
+        return dict(saved)
 
     def restore(self, states: dict[str, float], age: float | None, soc: float) -> None:
         """At rest meanwhile; for how long [s] if that is not known: for long."""

@@ -18,21 +18,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, field, fields, is_dataclass, replace
-from math import exp, inf, sqrt
-from typing import Any, TypeVar
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from math import exp, sqrt
+from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, EffectInputs, LoadModel
-from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
+from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
+from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import DRIFT, PriorRiding
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -672,57 +671,56 @@ class ConsumptionLearner:
         }
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Take a `snapshot`; KeyError, TypeError or ValueError, with nothing changed, for anything else.
+        """Take a `snapshot`, which was checked against `FIELDS`; ValueError for habits that no riding teaches.
 
         Habits are converted to the units of this vehicle file, which may have been calibrated since.
         """
-        price, speed = float(saved["unit"]["price"]), float(saved["unit"]["speed"])
-        if not (0 < price < inf and 0 < speed < inf):
-            raise ValueError("implausible unit of habits")
-        scales = price / self.prior_price, self.load.prior.speed / speed
-        state = _rebuilt(RidingState(self.prior), saved["state"])
-        state = replace(state, habits=_checked(state.habits.scaled(*scales)))
-        riders = {
-            _name(name): _checked(_rebuilt(self.prior, habits).scaled(*scales))
-            for name, habits in saved["riders"].items()
-        }
-        terrain = state.terrain
-        possible = all(0 <= x.unseen <= x.distance * (1 + 1e-9) and x.duration >= 0 for x in (state.sums, state.recent))
-        possible &= min(terrain.squares, terrain.stretches, terrain.unseen) >= 0
-        if not possible or len(riders) > CONSUMPTION.most_riders or saved["rider"] in riders:
-            raise ValueError("implausible riding")
-        rider, pattern = _name(saved["rider"]), restored_pattern(saved["pattern"])
-        effects = {str(name): float(x) for name, x in saved["effects"].items()}
-        auxiliary, still, moving = (float(saved[name]) for name in ("auxiliary_power", "still", "time_moving"))
-        self.auxiliaries.restore(auxiliary)
-        self.state, self.rider, self.other_riders, self.pattern = state, rider, riders, pattern
-        self.load.states, self.still, self.time_moving = effects, still, moving
+        unit, state = saved["unit"], saved["state"]
+        scales = unit["price"] / self.prior_price, self.load.prior.speed / unit["speed"]
+        sums, recent, terrain = Segment(**state["sums"]), Segment(**state["recent"]), Terrain(**state["terrain"])
+        self.state = RidingState(_habits(state["habits"], scales), sums, recent, terrain)
+        self.rider = saved["rider"]
+        self.other_riders = {name: _habits(habits, scales) for name, habits in saved["riders"].items()}
+        self.pattern = restored_pattern(saved["pattern"])
+        self.auxiliaries.restore(saved["auxiliary_power"])
+        self.load.states = dict(saved["effects"])
+        self.still, self.time_moving = saved["still"], saved["time_moving"]
         self._segment, self._second = Segment(), Second()
         self._history.clear()
 
 
-def _rebuilt(template: T, saved: Mapping[str, Any]) -> T:
-    """A tree of dataclasses of numbers like `template` out of `asdict` of one."""
-    found: dict[str, Any] = {}
-    for name, value in ((f.name, getattr(template, f.name)) for f in fields(template)):  # type: ignore[arg-type]
-        found[name] = _rebuilt(value, saved[name]) if is_dataclass(value) else float(saved[name])
-        if isinstance(found[name], float) and not abs(found[name]) < 1e15:
-            raise ValueError(f"its {name} cannot be")
-    return type(template)(**found)
-
-
-def _checked(habits: Habits) -> Habits:
-    """The same habits; ValueError for implausible ones."""
+def _habits(saved: Mapping[str, Mapping[str, float]], scales: tuple[float, float]) -> Habits:
+    """Habits out of `asdict` of them, scaled by price and pace; ValueError for a covariance that no filter has."""
+    habits = Habits(**{name: Quantity(**quantity) for name, quantity in saved.items()}).scaled(*scales)
     for q in habits.all:
         possible = all(abs(x) <= CONSUMPTION.most for x in astuple(q))
         possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
-        possible &= q.covariance**2 <= q.level_variance * q.deviation_variance * (1 + 1e-9)
-        if not possible:
-            raise ValueError("implausible habits")
+        if not possible or q.covariance**2 > q.level_variance * q.deviation_variance * (1 + 1e-9):
+            raise ValueError("is damaged: state.riding holds implausible habits")
     return habits
 
 
-def _name(value: object) -> str:
-    if not isinstance(value, str) or len(value) > CONSUMPTION.most_name_letters:
-        raise ValueError("implausible rider")
-    return value
+def _numbers(of: type, number: Number = FINITE) -> dict[str, Number]:
+    return dict.fromkeys((f.name for f in fields(of)), number)
+
+
+_HABITS = {quantity.name: _numbers(Quantity) for quantity in fields(Habits)}
+_POSITIVE = Number(0.0, 1e12)
+_SUMS = _numbers(Segment, Number(-1e12, 1e12)) | dict.fromkeys(("distance", "duration", "squares", "unseen"), _POSITIVE)
+FIELDS = {
+    "unit": dict.fromkeys(("price", "speed"), Number(1e-6, 1e6)),
+    "state": {
+        "habits": _HABITS,
+        "sums": _SUMS,
+        "recent": _SUMS,
+        "terrain": _numbers(Terrain, _POSITIVE) | {"climb": Number(-1e12, 1e12)},
+    },
+    "rider": Text(CONSUMPTION.most_name_letters),
+    "riders": Each(_HABITS, CONSUMPTION.most_riders),
+    "pattern": Each(Each(FINITE, 10), MOST_BINS),
+    "auxiliary_power": Number(-1e5, 1e5),  # W
+    "effects": Each(FINITE, 100),
+    "still": Number(0.0, 1e10),  # s
+    "time_moving": Number(0.0, 1e7),  # s
+}
+"""Of the saved state."""

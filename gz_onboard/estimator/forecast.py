@@ -12,11 +12,12 @@ from math import exp, hypot, log, sqrt
 from typing import Any
 
 from gz_onboard.constants import HOUR
+from gz_onboard.estimator import consumption
 from gz_onboard.estimator.ageing import Ageing
-from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.consumption import CONSUMPTION, ConsumptionLearner
 from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD
+from gz_onboard.estimator.saved_fields import Each, Number
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.cooling import pack_constants
 from gz_onboard.physics.drawable import Drawable, drawable
@@ -48,6 +49,11 @@ class ForecastConfig:
 
 
 FORECAST = ForecastConfig()
+FIELDS = consumption.FIELDS | {
+    "shown": {"gap": Number(-1e6, 1e6), "forecast": Each(Number(0.0, 1e12), 2, optional=True)},  # m; m, J
+    "on_routes": Each(Number(0.0, 1e12, optional=True), 2),
+}
+"""Of the saved state: what was learned of the riding."""
 
 
 @dataclass(frozen=True)
@@ -148,12 +154,8 @@ class RangeSmoother:
 
     @classmethod
     def restored(cls, saved: Mapping[str, Any]) -> RangeSmoother:
-        """A smoother out of its `snapshot`; KeyError, TypeError or ValueError for anything else."""
-        within("shown", saved)
-        if saved["forecast"] is None:
-            return cls(float(saved["gap"]))
-        range_, energy = map(float, saved["forecast"])
-        return cls(float(saved["gap"]), (range_, energy))
+        """A smoother out of its `snapshot`, which was checked."""
+        return cls(saved["gap"], tuple(saved["forecast"]) if saved["forecast"] else None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +213,7 @@ class Forecaster:
         """
         learner = self.learner
         expected = learner.expected(self._rough_way(soc, cell_temperature), ambient, altitude)
-        consumption = expected.consumption
+        price = expected.consumption
         load = log(expected.power), expected.form_factor_squared
         discharge = self._discharged((soc, cell_temperature, temperature_sd, ambient, *load))
         left = discharge.left
@@ -227,14 +229,14 @@ class Forecaster:
         variance = min(loss_variance + expected.variance, FORECAST.most_sd**2)
         p10, p90 = deciles(left.energy, down, up, variance)
         return Forecast(
-            range=left.energy / consumption,
-            p10=p10 / consumption,
-            p90=min(p90 / consumption, (left.energy + DECILE * up) / expected.least),
+            range=left.energy / price,
+            p10=p10 / price,
+            p90=min(p90 / price, (left.energy + DECILE * up) / expected.least),
             left=left,
             energy_sd=down,
             energy_sd_up=up,
-            consumption=consumption,
-            consumption_sd=consumption * sqrt(variance),
+            consumption=price,
+            consumption_sd=price * sqrt(variance),
             recent=learner.recent_consumption,
             mostly_prior=learner.mostly_prior,
             power=expected.power,
@@ -285,8 +287,6 @@ class Forecaster:
         return self.learner.snapshot() | {"shown": self.smoother.snapshot()}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Take a `snapshot`; KeyError, TypeError or ValueError, with nothing changed, for anything else."""
-        within("riding", saved)
-        smoother = RangeSmoother.restored(saved["shown"])
+        """Take a `snapshot`, which was checked against `FIELDS`; ValueError for habits that no riding teaches."""
         self.learner.restore(saved)
-        self.smoother = smoother
+        self.smoother = RangeSmoother.restored(saved["shown"])

@@ -75,7 +75,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
         try:
             how = How(task.filter_name, task.frames, task.signals, route, state=task.state)
             ridden = ride_through(ride, how, log, progress)
-            learned = text_of(ridden.pipeline, ridden.went_on) if ridden.went_on else None
+            learned = text_of(ridden.pipeline) if ridden.went_on else None
             summary = summary_of(ridden, task.log, task.picture)
             log.note(_RECORD, {**made_of, **_link(ridden, learned), _SUMMARY: summary_to_keep(summary)})
             log.close()

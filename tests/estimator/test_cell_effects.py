@@ -103,6 +103,6 @@ def test_steps_of_the_current_leave_no_error_and_the_sag_that_there_is(monkeypat
     monkeypatch.setattr(e.soc, "cell_error", kept)
     for event in bursts(120.0):
         e.handle(event)
-    late = np.array([x for x in errors if x is not None][300:])
+    late = np.array([x for x in errors if x is not None][60:])
     assert np.abs(late).max() < 0.003
     assert e.redundancy.currents.sag.ratio == pytest.approx(1.0, abs=0.03)

@@ -163,17 +163,6 @@ def test_nothing_known_is_followed_at_once():
     assert shown(raw, ridden, known=0.0)[150] == pytest.approx(raw[150], rel=0.002)
 
 
-@pytest.mark.parametrize(
-    "saved",
-    [{"gap": x, "forecast": None} for x in (1e9, float("nan"), "x", None)]
-    + [{"gap": 0.0, "forecast": x} for x in ([1.0], [-1.0, 1.0], [1.0, float("nan")], "ab", 3.0)]
-    + [{}],
-)
-def test_a_damaged_state_is_refused(saved):
-    with pytest.raises((KeyError, TypeError, ValueError)):
-        RangeSmoother.restored(saved)
-
-
 def test_a_worse_forecast_is_told_in_time():
     """8 km less within one, of 60: no kilometre takes off two, and it is told half way; 5 km, of 11: sooner."""
     ridden = np.full(4000, 10.0)
