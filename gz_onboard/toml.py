@@ -7,6 +7,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Collection, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ _HEADER = re.compile(r"[ \t]*(\[\[?)[ \t]*([A-Za-z_\"'][^\[\],]*)\]+[ \t]*(?:#.*
 _KEY = re.compile(r"[ \t]*([\w\"'-][\w\"'. \t-]{0,200})=")
 # The time to read a key grows with the square of its parts; four are the most in use.
 _DEEP_KEY = re.compile(r"(?:[\w-]++[ \t]*+\.[ \t]*+){20}")
+
+
+SMALLEST_STEP = 1e-6
 
 
 class Table:
@@ -124,6 +128,20 @@ class Table:
         """Return the list of numbers `key`, each within [low, high]; 1 to `LONGEST_LIST`."""
         numbers = self._list(key, f"must be a list of numbers, 1 to {LONGEST_LIST}")
         return tuple(self._number_of(number, key, low, high) for number in numbers)
+
+    def increasing(self, key: str, low: float, high: float, unit: str = "") -> tuple[float, ...]:
+        """The list of increasing numbers `key` in `unit`, each within [low, high].
+
+        Steps are `SMALLEST_STEP` or more: a slope over them must stay a number.
+        """
+        row, of = self.numbers(key), f" {unit}" if unit else ""
+        for x in row:
+            if not low <= x <= high:
+                raise self.error(f"{x:g}{of} is outside {low:g} to {high:g}{of}", key)
+        for a, b in pairwise(row):
+            if b - a < SMALLEST_STEP:
+                raise self.error(f"must increase, but {b:g}{of} follows {a:g}{of}", key)
+        return row
 
     def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
         """Return the list of rows of `columns` numbers `key`, each within [low, high]; `of` names them."""

@@ -15,8 +15,8 @@ from gz_onboard.events import MOST_EXTENDED, MOST_STANDARD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.battery_file import read_battery
 from gz_onboard.physics.derating import Derating, read_derating
-from gz_onboard.physics.effect import Effect
-from gz_onboard.physics.model import Model, read_model
+from gz_onboard.physics.effect import Effect, read_effects
+from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table, is_file
@@ -156,7 +156,7 @@ def read_vehicle(
     table.only(KEYS.split())
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
-    effects = read_model(table, effects_folder, users)
+    effects = read_effects(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     model, derating = Model(effects, parameters), read_derating(table)
     spin = derating.top_spin

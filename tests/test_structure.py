@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import BASE_EFFECTS
+from gz_onboard.physics.effect import BASE_EFFECTS, QUANTITIES
 
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
@@ -207,7 +206,7 @@ def test_imports_of_the_discovery_go_down_its_stages():
 def test_effects_are_known_by_what_they_declare():
     """No name of an effect outside its file, but for the list of those that a vehicle file gets that lists none."""
     effects = {path.stem for path in (PACKAGE / "physics/effects").glob("*.py")} - set(QUANTITIES)
-    listed = {PACKAGE / "physics/model.py": set(BASE_EFFECTS)}
+    listed = {PACKAGE / "physics/effect.py": set(BASE_EFFECTS)}
     for module in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "physics/effects").glob("*.py")):
         nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
         named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects

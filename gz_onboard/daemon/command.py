@@ -23,7 +23,7 @@ from gz_onboard.daemon.route import SOCKET
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
 from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.options import CHANNEL, add_shared, number
-from gz_onboard.physics.trust import ROOT
+from gz_onboard.physics.effect import ROOT
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.routes.ahead import read_ahead
 from gz_onboard.vehicle import Vehicle, read_vehicle

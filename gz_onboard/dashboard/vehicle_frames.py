@@ -116,9 +116,9 @@ class VehicleFrames:
 def cell_limits(derating: Derating) -> tuple[float, float]:
     """Temperatures [degC] between which the controller gives its full current; the usual ones if it says nothing."""
     curve = derating.current_by_cell_temperature
-    full = [at for at, share in zip(curve.at, curve.share, strict=True) if share >= 1.0] or list(RIDING_DEGC)
-    low = full[0] if curve.share[0] < 1.0 else RIDING_DEGC[0]
-    return low, full[-1] if curve.share[-1] < 1.0 else RIDING_DEGC[1]
+    full = [at for at, share in zip(curve.x, curve.y, strict=True) if share >= 1.0] or list(RIDING_DEGC)
+    low = full[0] if curve.y[0] < 1.0 else RIDING_DEGC[0]
+    return low, full[-1] if curve.y[-1] < 1.0 else RIDING_DEGC[1]
 
 
 class Day:

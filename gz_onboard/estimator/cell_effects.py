@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.effect import QUANTITIES, Port
 from gz_onboard.physics.model import Model, share_that_ages
 
 LARGEST = 1.0  # V of a cell, of a saved state
@@ -23,7 +23,7 @@ class CellEffects:
 
     def __init__(self, model: Model, battery: Battery) -> None:
         self._battery = battery
-        self._effects = [(x.effect.name, x, share_that_ages(x)) for _, x in model.cell_voltage]
+        self._effects = [(x.effect.name, x, share_that_ages(x)) for x in model.at(Port.CELL_VOLTAGE)]
         self._quantities = dict.fromkeys(QUANTITIES, 0.0)
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {name: 0.0 for name, _, _ in self._effects}  # V of a cell

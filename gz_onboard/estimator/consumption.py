@@ -31,7 +31,7 @@ from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import Model
-from gz_onboard.physics.riding import DRIFT, PriorRiding
+from gz_onboard.physics.riding import PriorRiding
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ConsumptionConfig:
     doubt: float = 1.25  # sd over the change that a faulty sensor taught: price and stops may err alike
     # Priors: sd of the level, from ride to ride, and of a segment
     level_sd: float = 0.15  # price of riders and roads of one kind of vehicle
-    price_scatter: float = 0.2 / DRIFT  # sd of a segment's price over that of rides
+    price_scatter: float = 0.2 / PriorRiding.drift  # sd of a segment's price over that of rides
     stops_sd: tuple[float, float, float] = (0.03, 0.01, 0.06)  # a wait of half a minute is 0.05 of the price
     pace_sd: tuple[float, float, float] = (0.25, 0.1, 0.4)
     factor_sd: tuple[float, float] = (0.03, 0.18)  # wind, tyres, luggage; a segment's, of eight commissioning rides

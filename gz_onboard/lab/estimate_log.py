@@ -134,7 +134,7 @@ def kept_in_turn(tasks: Sequence[EstimateTask]) -> list[EstimateTask]:
 
 def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
     """All that the estimates of a log depend on, as texts."""
-    effects = {Path(effect.term.__code__.co_filename) for effect in vehicle.model.effects}
+    effects = {effect.file for effect in vehicle.model.effects}
     files = {vehicle.file, vehicle.range_dbc, *vehicle.mapping.dbc_files, *(file for file in effects if file.is_file())}
     return {
         "version": f"{__version__}, summary {SUMMARY_VERSION}",

@@ -19,7 +19,8 @@ from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell
 from gz_onboard.dashboard.view import View
 from gz_onboard.estimator.signals import ACCEPTED_AFTER
 from gz_onboard.events import Activity, Estimate
-from gz_onboard.physics.derating import Derating, DeratingCurve
+from gz_onboard.physics.derating import Derating
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.served import PACK, Own, cells, odometer, own_frame
 from tests.dashboard.test_picture import HEALTHY, SOURCE
@@ -109,9 +110,9 @@ def test_a_cell_that_is_too_hot_or_too_cold_is_an_alert(activity, own, before, a
 def test_limits_are_those_of_the_controller():
     assert cell_limits(REFERENCE.derating) == (-5.0, 50.0)
     assert cell_limits(Derating()) == RIDING_DEGC
-    hot = DeratingCurve((0.0, 55.0, 60.0), (1.0, 1.0, 0.0))
+    hot = PiecewiseLinear((0.0, 55.0, 60.0), (1.0, 1.0, 0.0))
     assert cell_limits(Derating(current_by_cell_temperature=hot)) == (RIDING_DEGC[0], 55.0)
-    never = DeratingCurve((0.0, 55.0), (0.9, 0.5))
+    never = PiecewiseLinear((0.0, 55.0), (0.9, 0.5))
     assert cell_limits(Derating(current_by_cell_temperature=never)) == RIDING_DEGC
 
 

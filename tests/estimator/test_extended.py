@@ -299,7 +299,7 @@ def test_memory_between_road_and_pack_steps_each_second(tmp_path):
     (tmp_path / "slow_drag.py").write_text(
         '"""A drag that comes up slowly."""\n'
         "from gz_onboard.physics.effect import Parameter, Port\n"
-        "from gz_onboard.physics.elementary import exp\n"
+        "from gz_onboard.physics.functions import exp\n"
         "PORT = Port.WHEEL_FORCE\n"
         'PARAMETERS = (Parameter("slow_drag", "N", 20.0, 5.0, 0.0, 50.0, "made up for a test"),)\n'
         "def term(speed, *, slow_drag):\n"
