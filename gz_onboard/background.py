@@ -15,13 +15,12 @@ log = logging.getLogger("gz-onboard")
 class Background:
     """Makes calls one after the other on a separate thread; the caller never waits.
 
-    limit: how much may wait, in the weights that `call` is given. when_idle: called while nothing waits, as long as it
-    returns True. An exception is logged, and the next call is made.
+    limit: how much may wait, in the weights that `call` is given. An exception of a call is logged, and the next one
+    is made.
     """
 
-    def __init__(self, name: str, limit: int = 1, when_idle: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, name: str, limit: int = 1) -> None:
         self._limit = limit
-        self._when_idle = when_idle
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...], int]] = deque()
         self._weight = 0
         self._changed = threading.Condition()
@@ -72,29 +71,19 @@ class Background:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        idle_work = True
         while True:
             with self._changed:
+                self._changed.wait_for(lambda: self._calls or self._closing)
                 if not self._calls:
-                    if self._closing:
-                        return
-                    if not idle_work:
-                        self._changed.wait_for(lambda: self._calls or self._closing)
-                        idle_work = True
-                        continue
-                function, arguments, weight = self._calls[0] if self._calls else (None, (), 0)
+                    return
+                function, arguments, weight = self._calls[0]
             self._began = time.monotonic()
             try:
-                if function is None:
-                    idle_work = self._when_idle()
-                else:
-                    function(*arguments)
+                function(*arguments)
             except Exception:
                 log.exception("in the background")
-                idle_work = False
             self._began = None
-            if function is not None:
-                with self._changed:
-                    self._calls.popleft()
-                    self._weight -= weight
-                    self._changed.notify_all()
+            with self._changed:
+                self._calls.popleft()
+                self._weight -= weight
+                self._changed.notify_all()

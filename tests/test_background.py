@@ -49,24 +49,6 @@ def test_what_a_call_raises_is_told_and_the_next_is_made(caplog: pytest.LogCaptu
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_while_nothing_waits_it_does_what_else_there_is():
-    done = threading.Event()
-    left = [3, 2, 1]
-
-    def one() -> bool:
-        if left:
-            left.pop()
-            return True
-        done.set()
-        return False
-
-    background = Background("test", 1, one)
-    background.call(bool)
-    assert done.wait(30)
-    assert not left
-    assert background.close(30)
-
-
 def test_closing_does_not_wait_for_ever():
     going = threading.Event()
     background = Background("test")

@@ -9,30 +9,29 @@ from gz_onboard.background import Background
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.events import Frame
 
-_STUCK = 10.0  # s: no disk takes as long
+_STUCK_S = 10.0  # no disk takes as long
 
 
 class BackgroundRecorder:
-    """A `Recorder` on a thread of its own, for one that may not wait for a disk. Nothing else may use the recorder.
+    """Runs a `Recorder` on its own thread, so that the caller never waits for the disk.
 
-    What is logged is handed over at `sync`, all at once: the thread is woken once a tick, not for each sample. limit:
-    how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out, whole
-    portions of it, and counted in `lost_frames`.
+    Entries are handed over at `sync`, all at once: the thread wakes once a tick, not for each sample. limit: how many
+    frames may wait for the disk (each value of a sample counts as one frame). Beyond it a whole portion is dropped, and
+    its frames are counted in `lost_frames`. Nobody else may use the recorder.
     """
 
     def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
         self._recorder = recorder
-        self._thread = Background("log", limit, recorder.complete_one)
-        self._left_out = 0
+        self._thread = Background("log", limit)
+        self._dropped_frames = 0
         self._full = False
-        self._now_ns = 0
         self._portion: list[tuple[Callable[..., None], tuple[Any, ...]]] = []  # since the last `sync`
         self._frames = self._values = 0  # in it
 
     @property
     def failing(self) -> bool:
         """Whether frames are lost: errors, or a disk that is too slow or does not answer."""
-        return self._recorder.failing or self._full or self._thread.stuck > _STUCK
+        return self._recorder.failing or self._full or self._thread.stuck > _STUCK_S
 
     @property
     def last_error(self) -> str:
@@ -44,28 +43,28 @@ class BackgroundRecorder:
     @property
     def lost_frames(self) -> int:
         """Frames not known to be in a file."""
-        return self._recorder.lost_frames + self._left_out
+        return self._recorder.lost_frames + self._dropped_frames
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """As that of `Recorder`; to be called before anything is logged."""
+        """As `Recorder.channel`; call it before anything is logged."""
         self._recorder.channel(topic, json_schema, metadata)
 
     def frames(self, batch: Sequence[Frame]) -> None:
-        """As that of `Recorder`, at the next `sync`; `batch` may not be changed afterwards."""
+        """As `Recorder.frames`, at the next `sync`; `batch` may not be changed afterwards."""
         if batch:
             self._portion.append((self._recorder.frames, (batch,)))
             self._frames += len(batch)
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
-        """As that of `Recorder`, at the next `sync`; `values` may not be changed afterwards."""
+        """As `Recorder.sample`, at the next `sync`; `values` may not be changed afterwards."""
         self._portion.append((self._recorder.sample, (topic, time_ns, values, seen_ns)))
         self._values += len(values)
 
     def sync(self, now_ns: int) -> None:
-        """Hand over what was logged since the last time, then as that of `Recorder`."""
-        self._now_ns = now_ns
+        """Hand over what was logged since the last time, then sync as `Recorder.sync`."""
         if self._full and self._thread.load < 0.5:
             self._full = False
+        self._portion.append((self._recorder.sync, (now_ns,)))
         self._hand_over()
 
     def close(self, seconds: float) -> bool:
@@ -75,14 +74,14 @@ class BackgroundRecorder:
         return self._thread.close(seconds)
 
     def _hand_over(self) -> None:
-        portion, frames, values = self._portion, self._frames, self._values
+        portion, frames, weight = self._portion, self._frames, self._frames + self._values
         self._portion, self._frames, self._values = [], 0, 0
-        # Of nothing to be written the sync weighs something, too, lest many wait for a disk that does not answer.
-        if not self._thread.call(self._write, portion, weight=max(frames + values, 1)) and portion:
-            self._left_out += frames
+        # A mere sync has a weight, too: else they would pile up behind a disk that does not answer.
+        if not self._thread.call(_call_all, portion, weight=max(weight, 1)) and weight:
+            self._dropped_frames += frames
             self._full = True
 
-    def _write(self, portion: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> None:
-        for function, arguments in portion:
-            function(*arguments)
-        self._recorder.sync(self._now_ns)
+
+def _call_all(portion: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> None:
+    for function, arguments in portion:
+        function(*arguments)

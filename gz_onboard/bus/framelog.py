@@ -1,4 +1,4 @@
-"""Raw CAN frames in blocks: the binary form in which the log holds them, layout in docs/log-format.md.
+"""Encode raw CAN frames as the binary blocks of our log (layout: docs/log-format.md).
 
 Within a block the data bytes stand by kind of frame (same identifier, channel and length) and there by byte
 position, because a byte resembles the same byte of the frame before it far more than its neighbour: the same
@@ -9,11 +9,9 @@ to the nanosecond and the order of the frames is kept.
 from __future__ import annotations
 
 import struct
-import sys
-from array import array
 from collections import Counter
-from collections.abc import Sequence
-from itertools import accumulate, chain
+from collections.abc import Iterator, Sequence
+from itertools import accumulate, repeat
 from math import gcd
 from operator import sub
 
@@ -43,7 +41,6 @@ _KIND = struct.Struct("<IBB")
 _VERSION = 1
 _WIDTHS = {2: "h", 4: "i", 8: "q"}
 _MAX_KINDS = 0xFFFF
-_SWAP = sys.byteorder == "big"
 
 
 def encode_block(frames: Sequence[Frame]) -> bytes:
@@ -73,8 +70,8 @@ def encode_block(frames: Sequence[Frame]) -> bytes:
     head = _HEAD.pack(_VERSION, width, len(number), len(frames), times[0], unit)
     parts = [head]
     parts += [_KIND.pack(*key) for key in number]
-    parts.append(_little(array("B" if len(number) <= 256 else "H", order)).tobytes())
-    planes = _little(array(_WIDTHS[width], steps)).tobytes()
+    parts.append(struct.pack(f"<{len(order)}{'B' if len(number) <= 256 else 'H'}", *order))
+    planes = struct.pack(f"<{len(steps)}{_WIDTHS[width]}", *steps)
     parts += [planes[i::width] for i in range(width)]
 
     by_kind: list[list[bytes]] = [[] for _ in number]
@@ -104,15 +101,13 @@ def decode_block(block: bytes) -> list[Frame]:
     if len(block) < data_at:
         raise ValueError(f"a block of {count} frames is cut off")
     table = list(_KIND.iter_unpack(block[_HEAD.size : order_at]))
-    order = _little(array(order_type, block[order_at:steps_at]))
+    order = struct.unpack_from(f"<{count}{order_type}", block, order_at)
     if max(order) >= kinds:
         raise ValueError("a frame of a kind that the block does not have")
-    steps = _little(array(_WIDTHS[width], bytes(_rows(block, steps_at, count - 1, width))))
+    steps = struct.unpack(f"<{count - 1}{_WIDTHS[width]}", _rows(block, steps_at, count - 1, width))
     times = accumulate((step * unit for step in steps), initial=first)
     datas = _datas(block, data_at, order, [length for _, _, length in table])
-    identifiers = [identifier for identifier, _, _ in table]
-    channels = [channel for _, channel, _ in table]
-    return list(zip(times, map(identifiers.__getitem__, order), datas, map(channels.__getitem__, order), strict=True))
+    return [(time, table[kind][0], data, table[kind][1]) for time, kind, data in zip(times, order, datas, strict=True)]
 
 
 def _rows(block: bytes, at: int, count: int, width: int) -> bytearray:
@@ -123,33 +118,18 @@ def _rows(block: bytes, at: int, count: int, width: int) -> bytearray:
     return rows
 
 
-def _datas(block: bytes, position: int, order: array[int], lengths: Sequence[int]) -> list[bytes]:
+def _datas(block: bytes, position: int, order: Sequence[int], lengths: Sequence[int]) -> list[bytes]:
     """The data of the frames in their order. `order`: the kind of each; `lengths`: of the data, by kind."""
-    of_kind: list[list[bytes]] = []
+    of_kind: list[Iterator[tuple[bytes]]] = []
     numbers = Counter(order)
     for kind, length in enumerate(lengths):
         number = numbers[kind]
         end = position + number * length
         if end > len(block):
             raise ValueError(f"a block of {len(order)} frames is cut off")
-        if length:
-            of_kind.append(
-                [data for (data,) in struct.iter_unpack(f"{length}s", _rows(block, position, number, length))]
-            )
-        else:
-            of_kind.append([b""] * number)
+        rows = _rows(block, position, number, length)
+        of_kind.append(struct.iter_unpack(f"{length}s", rows) if length else repeat((b"",)))
         position = end
     if position != len(block):
         raise ValueError(f"{len(block) - position} bytes too many after a block of {len(order)} frames")
-    # Stable sorting of the frames' places by kind gives, for each frame in order of kind, where it belongs.
-    datas = [b""] * len(order)
-    for place, data in zip(sorted(range(len(order)), key=order.__getitem__), chain.from_iterable(of_kind), strict=True):
-        datas[place] = data
-    return datas
-
-
-def _little(values: array[int]) -> array[int]:
-    """The array itself on a little-endian machine; else with its bytes swapped: what is stored is little-endian."""
-    if _SWAP:
-        values.byteswap()
-    return values
+    return [next(of_kind[kind])[0] for kind in order]

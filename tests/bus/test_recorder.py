@@ -16,11 +16,10 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.background import Background
-from gz_onboard.bus import framelog, logfile, logs, recorder
+from gz_onboard.bus import framelog, logfile, logs
 from gz_onboard.bus.background_recorder import BackgroundRecorder
-from gz_onboard.bus.completion import complete, is_complete
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
@@ -146,7 +145,7 @@ def test_syncing_brings_the_file_to_the_disk_at_most_once_in_its_interval(
         real(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", counted)
-    log = Recorder(tmp_path, "reference", limits=Limits(sync_s=1.0))
+    log = Recorder(tmp_path, "reference", limits=LogLimits(sync_s=1.0))
     drive(log, ticks(10))
     assert 8 <= len(synced) <= 10
     log.close()
@@ -157,7 +156,7 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
     foreign[0].write_text("mine")
     foreign[1].write_bytes(bytes(5000))
     foreign[2].mkdir()
-    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
+    log = Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
     noise = random.Random(1)
     batches = [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch] for batch in ticks(60)]
     for batch in batches:
@@ -176,7 +175,7 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
 
 
 def test_files_are_rotated_by_age_and_each_stands_for_itself(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", attachments={"a.dbc": b"text"}, limits=Limits(max_age_s=10))
+    log = Recorder(tmp_path, "ref", attachments={"a.dbc": b"text"}, limits=LogLimits(max_age_s=10))
     log.channel("/estimate", SCHEMA)
     batches = ticks(25)
     for batch in batches:
@@ -213,7 +212,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 def test_a_write_error_is_counted_and_recording_resumes_with_a_new_file(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", limits=Limits(retry_s=5, sync_s=1))
+    log = Recorder(tmp_path, "ref", limits=LogLimits(retry_s=5, sync_s=1))
     log.channel("/estimate", SCHEMA)
     batches = ticks(40)
 
@@ -252,7 +251,7 @@ def test_a_log_file_itself_lets_the_error_through() -> None:
 
 def test_a_directory_that_cannot_be_made_is_counted_not_raised(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    log = Recorder(tmp_path / "file" / "logs", "ref", limits=Limits(retry_s=5))
+    log = Recorder(tmp_path / "file" / "logs", "ref", limits=LogLimits(retry_s=5))
     drive(log, ticks(11))
     log.close()
     assert log.errors == 3  # at once, after 5 s and after 10 s
@@ -275,7 +274,7 @@ def test_an_undeclared_topic_is_a_mistake(tmp_path: Path) -> None:
 
 def test_limits_that_cannot_be_kept_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not fit"):
-        Recorder(tmp_path, "ref", limits=Limits(max_file_bytes=2000, max_total_bytes=1000))
+        Recorder(tmp_path, "ref", limits=LogLimits(max_file_bytes=2000, max_total_bytes=1000))
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -295,7 +294,7 @@ YEAR = 365 * 86400 * SECOND
 
 
 def test_with_the_clock_set_back_the_oldest_go_first_and_never_the_one_being_written(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
+    log = Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
     noise = random.Random(1)
     batches = [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch] for batch in ticks(90)]
     for number, batch in enumerate(batches):
@@ -320,17 +319,14 @@ def test_the_running_number_goes_on_after_a_restart(tmp_path: Path) -> None:
     assert names[2] == "20250615T150640Z_ref~43.mcap"
 
 
-def test_a_log_that_another_writes_is_neither_deleted_nor_completed(tmp_path: Path) -> None:
+def test_a_log_that_another_writes_is_not_deleted(tmp_path: Path) -> None:
     other = Recorder(tmp_path, "other")
     drive(other, ticks(3))
     assert other.path is not None
-    log = Recorder(tmp_path, "ref", limits=Limits(max_file_bytes=5000, max_total_bytes=5000))
-    assert not recorder._delete(other.path)
-    while log.complete_one():
-        pass
-    assert not is_complete(other.path)
+    log = Recorder(tmp_path, "ref", limits=LogLimits(max_file_bytes=5000, max_total_bytes=5000))
     drive(log, ticks(1))
     log.close()
+    assert other.path.exists()
     other.close()
     assert read(other.path) == flat(ticks(3))
 
@@ -338,7 +334,7 @@ def test_a_log_that_another_writes_is_neither_deleted_nor_completed(tmp_path: Pa
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_directory_that_is_taken_away_is_noticed_and_made_again(tmp_path: Path, moved: bool) -> None:
     folder, elsewhere = tmp_path / "logs", tmp_path / "elsewhere"
-    log = Recorder(folder, "ref", limits=Limits(sync_s=1))
+    log = Recorder(folder, "ref", limits=LogLimits(sync_s=1))
     drive(log, ticks(3))
     if moved:
         folder.rename(elsewhere)
@@ -378,7 +374,7 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
 ) -> None:
     disk = Disk(400_000, tmp_path)
     monkeypatch.setattr(os, "statvfs", disk.statvfs)
-    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, retry_s=1))
+    log = Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5, retry_s=1))
     noise = random.Random(1)
     least = disk.size
     failing = []
@@ -399,14 +395,15 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
     assert all(is_complete(path) for path in left)
 
 
-# --- completing ------------------------------------------------------------------------------------------------
+# --- power cuts ------------------------------------------------------------------------------------------------
 
 
-def cut_off(tmp_path: Path, seconds: float = 8) -> tuple[bytes, int]:
-    """A log with frames, samples and attachments, and how much of it is on the disk before it is closed."""
-    log = Recorder(tmp_path / "whole", "ref", {"k": "v"}, {"a.dbc": b"text"}, limits=Limits(sync_s=1))
+def test_a_log_cut_off_anywhere_is_read_as_far_as_it_was_synced(tmp_path: Path) -> None:
+    """The file as a power cut leaves it: synced up to some byte, perhaps with rubbish from the disk behind it."""
+    log = Recorder(tmp_path / "whole", "ref", {"k": "v"}, {"a.dbc": b"text"}, limits=LogLimits(sync_s=1))
     log.channel("/estimate", SCHEMA, {"rate": "1 Hz"})
-    for number, batch in enumerate(ticks(seconds)):
+    batches = ticks(8)
+    for number, batch in enumerate(batches):
         log.frames(batch)
         if number % 25 == 0:
             log.sample("/estimate", batch[0][0], {"range": number, "soc": None})
@@ -414,115 +411,35 @@ def cut_off(tmp_path: Path, seconds: float = 8) -> tuple[bytes, int]:
     assert log.path is not None
     there = log.path.stat().st_size
     log.close()
-    return log.path.read_bytes(), there
-
-
-def contents(path: Path) -> tuple[list[bytes], list[str], dict[str, Any]]:
-    """What another reader, which needs the summary, finds: messages, topics, attachments and metadata."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        messages = [message.data for _, _, message in reader.iter_messages(log_time_order=False)]
-        assert summary.statistics.message_count == len(messages)
-        assert sum(summary.statistics.channel_message_counts.values()) == len(messages)
-        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
-        topics = sorted(channel.topic for channel in summary.channels.values())
-        extra = {a.name: a.data for a in reader.iter_attachments()} | {
-            m.name: m.metadata for m in reader.iter_metadata()
-        }
-        for chunk in summary.chunk_indexes:
-            assert chunk.message_index_offsets
-            for offset in chunk.message_index_offsets.values():
-                stream.seek(offset)
-                assert stream.read(1) == b"\x07"
-    return messages, topics, extra
-
-
-def test_a_log_cut_off_anywhere_is_completed_for_any_reader(tmp_path: Path) -> None:
-    data, there = cut_off(tmp_path)
+    data, sent = log.path.read_bytes(), flat(batches)
     path = tmp_path / "cut.mcap"
-    path.write_bytes(data)
-    whole = contents(path)
-    complete_data = int.from_bytes(data[-28:-20], "little") - 13  # where the record of the data's end begins
     source = random.Random(2)
-    lengths = [there, there - 1, len(data) - 1, len(data) - 8, *(source.randrange(9, len(data)) for _ in range(150))]
-    for number, length in enumerate(lengths):
-        tail = (b"", bytes(3000), source.randbytes(3000))[number % 3]
-        path.write_bytes(data[:length] + tail)
-        os.utime(path, (1e9, 1e9))
-        before = [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch] if length > 400 else []
-        assert complete(path)
-        assert is_complete(path)
-        assert path.stat().st_mtime == 1e9
-        messages, topics, extra = contents(path)
-        assert messages == whole[0][: len(messages)]
-        if length >= complete_data:
-            assert (messages, topics, extra) == whole
+    for number, length in enumerate([there, there - 1, *(source.randrange(2000, there) for _ in range(60))]):
+        path.write_bytes(data[:length] + (b"", bytes(3000), source.randbytes(3000))[number % 3])
         damages: list[logs.LogDamage] = []
-        after = (
-            [frame for batch in logs.read_frames(path, on_damage=damages.append) for frame in batch] if topics else []
-        )
-        assert after == before
-        assert not damages
-        once = path.read_bytes()
-        assert complete(path)
-        assert path.read_bytes() == once  # nothing to be done the second time
+        found = [frame for batch in logs.read_frames(path, on_damage=damages.append) for frame in batch]
+        assert found == sent[: len(found)]
+        assert len(damages) == 1
+        assert not is_complete(path)
+        assert logs.read_metadata(path)["k"] == "v"
+        assert logs.read_attachments(path) == {"a.dbc": b"text"}
+        samples = [(topic, values["range"]) for topic, _, values in logs.read_samples(path)]
+        assert samples == [("/estimate", 25 * i) for i in range(len(samples))]
+    path.write_bytes(data[:there])
+    assert sent[-1][0] - read(path)[-1][0] < 2 * SECOND
 
 
-def test_what_is_broken_in_the_middle_stays_and_the_rest_is_indexed(tmp_path: Path) -> None:
-    data, there = cut_off(tmp_path)
-    path = tmp_path / "cut.mcap"
-    broken = bytearray(data[:there])
-    broken[there // 2] ^= 0xFF
-    path.write_bytes(broken)
-    before = [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch]
-    assert complete(path)
-    assert path.read_bytes()[: there // 2] == bytes(broken[: there // 2])
-    assert [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch] == before
-    messages, _, _ = contents(path)
-    assert flat([framelog.decode_block(m) for m in messages if m[:1] == b"\1"]) == before
-
-
-def test_a_recorder_completes_what_was_left_of_before_and_nothing_else(tmp_path: Path) -> None:
-    data, there = cut_off(tmp_path)
-    folder = tmp_path / "logs"
-    folder.mkdir()
-    names = ["20250615T150640Z_ref.mcap", "20250615T150740Z_ref~2.mcap", "20250615T150840Z_ref~3.mcap"]
-    (folder / names[0]).write_bytes(data[:there])
-    (folder / names[1]).write_bytes(b"")
-    (folder / names[2]).write_bytes(data)
-    others = {"ride.mcap": data[:there], "20250615T150640Z_ref~4.mcap": b"no MCAP file at all, named like one"}
-    for name, content in others.items():
-        (folder / name).write_bytes(content)
-    log = Recorder(folder, "ref")
-    drive(log, ticks(1, START + 900 * SECOND))
-    steps = 0
-    while log.complete_one():
-        steps += 1
-    assert steps == 3
-    assert log.path is not None
-    assert not is_complete(log.path)
+def test_a_log_without_a_byte_goes_when_the_next_one_begins(tmp_path: Path) -> None:
+    empty = tmp_path / "20250615T150740Z_ref~2.mcap"
+    empty.write_bytes(b"")
+    others = [tmp_path / "ride.mcap", tmp_path / "20250615T150640Z_ref~4.mcap"]
+    for other in others:
+        other.write_bytes(b"no log, but not empty")
+    log = Recorder(tmp_path, "ref")
+    drive(log, ticks(1))
     log.close()
-    assert contents(folder / names[0])[0]
-    assert not (folder / names[1]).exists()
-    assert (folder / names[2]).read_bytes() == data
-    assert {name: (folder / name).read_bytes() for name in others} == others
-
-
-def test_a_file_that_an_error_has_cut_off_is_completed_at_once(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=1, retry_s=1000))
-    assert not log.complete_one()
-    with files_of_at_most(5_000):
-        drive(log, ticks(30))
-    assert log.errors == 1
-    assert log.path is not None
-    before = [frame for batch in logs.read_frames(log.path, on_damage=print) for frame in batch]
-    assert before
-    assert log.complete_one()
-    assert is_complete(log.path)
-    assert read(log.path) == before
+    assert not empty.exists()
+    assert all(other.read_bytes() == b"no log, but not empty" for other in others)
 
 
 # --- in the background -----------------------------------------------------------------------------------------
@@ -581,7 +498,7 @@ def test_it_goes_on_syncing_though_a_sync_is_done_before_its_caller_goes_on(
     monkeypatch.setattr("gz_onboard.bus.background_recorder.Background", Prompt)
     synced: list[int] = []
     monkeypatch.setattr(os, "fdatasync", synced.append)
-    behind = BackgroundRecorder(Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5)), limit=10**9)
+    behind = BackgroundRecorder(Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5)), limit=10**9)
     for batch in ticks(4):
         behind.frames(batch)
         behind.sync(batch[-1][0])
@@ -601,7 +518,7 @@ def test_a_disk_that_does_not_answer_holds_up_nobody_and_what_is_lost_is_counted
         real(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", late)
-    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5))
+    log = Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5))
     behind = BackgroundRecorder(log, limit=2000)
     batches = ticks(20)  # 10000 frames; were it to wait with the disk, it would be for a minute at each sync
     for batch in batches:

@@ -16,10 +16,9 @@ from gz_onboard.bus import replay as command
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.bus.replay import Sent, bus_sender, replay
-from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
-from tests.support import HEARS_CTRL_C
+from tests.support import HEARS_CTRL_C, write_log
 
 START = 1_750_000_000_000_000_000
 
@@ -30,8 +29,7 @@ def frames(count: int, step_ns: int = 5_000_000) -> list[Frame]:
 
 def log(tmp_path: Path, content: list[Frame]) -> Path:
     path = tmp_path / "a.log"
-    with path.open("w") as stream:
-        write_candump(stream, [content])
+    write_log(path, content)
     return path
 
 
