@@ -23,8 +23,8 @@ from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
 from gz_onboard.physics.battery import Battery
@@ -520,7 +520,7 @@ class ConsumptionLearner:
             segment.level += repeated
         else:
             self._stand(second.seconds)
-        if self.still <= STOP_TIME:  # a longer stop takes energy, but teaches nothing
+        if self.still <= MOTION.stop_time:  # a longer stop takes energy, but teaches nothing
             segment.stops += 0.0 if moving else second.energy - auxiliary
             segment.auxiliary += auxiliary
             segment.duration += second.seconds

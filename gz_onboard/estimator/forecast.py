@@ -50,8 +50,7 @@ class ForecastConfig:
 
 FORECAST = ForecastConfig()
 FIELDS = consumption.FIELDS | {
-    "shown": {"gap": Number(-1e6, 1e6), "forecast": Each(Number(0.0, 1e12), 2, optional=True)},  # m; m, J
-    "on_routes": Each(Number(0.0, 1e12, optional=True), 2),
+    "shown": {"gap": Number(-1e6, 1e6), "forecast": Each(Number(0.0, 1e12), 2, optional=True)}  # m; m, J
 }
 """Of the saved state: what was learned of the riding."""
 

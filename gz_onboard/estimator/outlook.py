@@ -7,10 +7,10 @@ from math import ceil, inf, sqrt
 from typing import NamedTuple
 
 from gz_onboard.constants import HOUR
-from gz_onboard.estimator.activity import CHARGING_RATE
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.route_ahead import Pack, RoadAhead
+from gz_onboard.estimator.motion import MOTION
+from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.sources import PackReading
 from gz_onboard.events import Activity, Estimate, Reason
 from gz_onboard.physics.battery import Battery
@@ -71,9 +71,9 @@ class Now(NamedTuple):
 class Outlook:
     """Makes a forecast each second and keeps it."""
 
-    def __init__(self, forecaster: Forecaster, battery: Battery, road: RoadAhead) -> None:
+    def __init__(self, forecaster: Forecaster, battery: Battery, route: RouteForecaster) -> None:
         self.forecast: Forecast | None = None
-        self._forecaster, self._battery, self._road = forecaster, battery, road
+        self._forecaster, self._battery, self._route = forecaster, battery, route
         self._charge_power: float | None = None  # W into the pack; None unless charging
         self._charge_current = 0.0  # A into the pack
         self._to_full: float | None = None  # s
@@ -100,14 +100,14 @@ class Outlook:
         known = now.temperature, now.temperature_sd, now.conditions.ambient, now.conditions.altitude
         forecaster, learner = self._forecaster, self._forecaster.learner
         free = forecaster.forecast(now.soc, now.soc_sd, *known, now.loss_variance)
-        pack = Pack(now.soc, now.soc_sd, now.loss_variance)
         voltage, current = now.reading.voltage, now.reading.current
         charging = now.activity is Activity.CHARGING
         if abs(now.soc - self._soc) > OUTLOOK.soc_step * self._soc > 0:
             forecaster.smoother.show_next()
         self._soc = now.soc
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
-        self.forecast = forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
+        along = self._route.forecast(now.time, free, (now.soc, now.soc_sd), now.loss_variance, now.conditions)
+        self.forecast = forecaster.shown(along, drawn)
         self._factor = learner.consumption_factor, sqrt(learner.habits.factor.variance)
         if charging and voltage and current is not None:
             self._charge(elapsed, now, voltage, current)
@@ -121,13 +121,13 @@ class Outlook:
         self._charge_current += share * (-current - self._charge_current)
         self._charge_power = max(voltage * self._charge_current, 0.0)
         # While less flows, as in a pause, the time to full is unknown.
-        flows = -current > CHARGING_RATE * self._battery.pack_capacity(now.temperature)
+        flows = -current > MOTION.charging_rate * self._battery.pack_capacity(now.temperature)
         to_full = time_to_full(self._battery, now.soc, self._charge_current, now.temperature)
         self._to_full = to_full if flows else None
 
     def report(self, estimate: Estimate) -> None:
         """Write the forecast into `estimate`."""
-        self._road.report(estimate)
+        self._route.report(estimate)
         forecast = self.forecast
         if forecast is None:
             return

@@ -223,7 +223,7 @@ def test_snapshot_goes_on_as_if_nothing_had_been():
 def test_a_damaged_snapshot_is_refused(damage):
     f = forecaster()
     ride(f, 4)
-    declared = {name: part for name, part in forecast_module.FIELDS.items() if name != "on_routes"}
+    declared = forecast_module.FIELDS
     check(declared, json.loads(json.dumps(f.snapshot())))
     with pytest.raises(ValueError, match="damaged"):
         check(declared, {**f.snapshot(), **damage})

@@ -14,8 +14,6 @@ from gz_onboard.estimator.saved_fields import check
 from gz_onboard.events import Group
 from tests.estimator.life import BATTERY, VEHICLE, estimator
 
-FIELDS = {name: part for name, part in forecast.FIELDS.items() if name != "on_routes"}
-
 
 def forecaster() -> Forecaster:
     return Forecaster(VEHICLE.model, BATTERY.own(), VEHICLE.riding)
@@ -89,9 +87,9 @@ def test_damaged_riders_are_refused(damage):
     f = forecaster()
     f.ridden_by("anna")
     saved = json.loads(json.dumps(f.snapshot()))
-    check(FIELDS, saved)
+    check(forecast.FIELDS, saved)
     with pytest.raises(ValueError, match="damaged"):
-        check(FIELDS, {**saved, **damage})
+        check(forecast.FIELDS, {**saved, **damage})
 
 
 def test_a_signal_names_the_rider_while_the_vehicle_stands():
