@@ -422,11 +422,6 @@ class ConsumptionLearner:
         return min(max(1 - self.habits.price.variance / self.prior.price.variance, 0.0), 1.0)
 
     @property
-    def factor_known(self) -> float:
-        """The same of the consumption factor."""
-        return min(max(1 - self.habits.factor.variance / self.load.prior.factor_sd**2, 0.0), 1.0)
-
-    @property
     def recent_factor(self) -> float:
         """Measured over modelled energy of about the last kilometre; 1 while that is not known."""
         recent = self.state.recent

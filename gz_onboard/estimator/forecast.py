@@ -238,8 +238,8 @@ class Forecaster:
             consumption_sd=price * sqrt(variance),
             recent=learner.recent_consumption,
             mostly_prior=learner.mostly_prior,
-            power=expected.power,
-            form_factor_squared=expected.form_factor_squared,
+            power=exp(discharge.inputs[4]),  # that the energy was computed for
+            form_factor_squared=discharge.inputs[5],
             cells=discharge.cells,
             known_from=learner.habits.price.known_from,
         )
