@@ -107,7 +107,7 @@ def judge(file: Path, vehicle_file: Path) -> Trip:
 
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
     feed(pipeline, batches)
-    e, segments = seen[0], pipeline.estimator.forecaster.riding.segments
+    e, sums = seen[0], pipeline.estimator.forecaster.learner.state.sums
     assert e.range and e.range_p10 and e.range_p90 and e.consumption_expected and e.energy_left
     way, energy, charge = (values[-1] - values[row] for values in (car.distance, car.energy, car.soc))
     window = vehicle.pack.window
@@ -122,7 +122,7 @@ def judge(file: Path, vehicle_file: Path) -> Trip:
         soc_start=errors[0][0],
         soc_rms=_rms(error[0] for error in errors),
         shown_rms=_rms(error[1] for error in errors),
-        modelled=sum(s.modelled for s in segments) / sum(s.measured for s in segments) - 1,
+        modelled=sums.modelled / sums.measured - 1,
         at=car.distance[row] / car.distance[-1],
         ours=energy / e.consumption_expected / way - 1,
         rule=car.distance[row] / (car.soc[row] - car.soc[0]) * charge / way - 1,

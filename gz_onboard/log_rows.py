@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.estimator.ageing import Learned
-from gz_onboard.estimator.drawn import Drawn
+from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
 from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC, location_row
@@ -130,15 +130,15 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     return row | ({"forgotten": " ".join(why.forgotten)} if why.forgotten else {})
 
 
-def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) -> dict[str, object]:
+def ride_row(last: Estimate, energy: EnergyCounter, ambient: float | None, rider: str) -> dict[str, object]:
     """Return distance and energy up to the `last` estimate as a row; ambient: [degC]."""
     return {
         "time": round(last.time, 3),
         "distance": round(last.distance, 2),
-        "energy": None if drawn.net is None else round(drawn.net, 1),
-        "energy_recovered": round(drawn.recovered, 1),
-        "energy_distance": round(drawn.distance, 2),
-        "energy_missing": round(drawn.missing, 1),
+        "energy": None if energy.net is None else round(energy.net, 1),
+        "energy_recovered": round(energy.recovered, 1),
+        "energy_distance": round(energy.distance, 2),
+        "energy_missing": round(energy.missing, 1),
         "ambient_temperature": None if ambient is None else round(ambient, 2),
         "rider": rider,
     }

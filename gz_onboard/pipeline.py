@@ -16,8 +16,8 @@ from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.estimator import reasons
-from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
+from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, WINDOW, Estimate, Frame, Reason, State, hexadecimal
@@ -91,7 +91,7 @@ class Pipeline:
         self.log_lost = 0  # frames that are in no log; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
-        self.drawn = Drawn()
+        self.energy = EnergyCounter()
         self.last: Estimate | None = None
         self.last_known: Estimate | None = None  # the last that had a range
         self._log = log
@@ -169,7 +169,7 @@ class Pipeline:
             if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
                 estimate.state = State.DEGRADED
         self.last = estimate
-        self.drawn.take(estimate)
+        self.energy.add_estimate(estimate)
         if estimate.range is not None and estimate.state in KNOWN:
             self.last_known = estimate
         if self._observer:
@@ -252,7 +252,7 @@ class Pipeline:
         """What the estimates of a log do not say of the ride, since the start."""
         last, estimator = self.last or Estimate(0.0), self.estimator
         return ride_row(
-            last, self.drawn, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.riders.now
+            last, self.energy, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.learner.rider
         )
 
 

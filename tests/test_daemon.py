@@ -271,7 +271,7 @@ def without_numbers(snapshot: Snapshot) -> None:
 
 
 def without_states(snapshot: Snapshot) -> None:
-    snapshot["riding"]["states"] = None
+    snapshot["riding"]["effects"] = None
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +346,7 @@ def not_a_number(snapshot: Snapshot) -> None:
         (without_numbers, "state.covariance.0 is 'a'"),
         (impossible_covariance, "state.covariance is impossible"),
         (incomplete, "state has "),
-        (without_states, "state.riding.states is None"),
+        (without_states, "state.riding.effects is None"),
         (odd_capacity, "implausible capacity"),
         (odd_weakest, "state.learned.weakest has ['of'], not of, known, kept"),
         (without_learned, "state.learned has [1, 2], not capacity, resistance, weakest"),

@@ -21,7 +21,7 @@ from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import Daemon, foreign_text, state_text
 from gz_onboard.daemon.route import SOCKET
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
-from gz_onboard.estimator.riders import LONGEST_NAME
+from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.effect import ROOT
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking, range_publisher
@@ -58,8 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _rider(text: str) -> str:
-    if not text or len(text) > LONGEST_NAME:
-        raise argparse.ArgumentTypeError(f"must be a name of 1 to {LONGEST_NAME} letters, is {shown(text)}")
+    most = CONSUMPTION.most_name_letters
+    if not text or len(text) > most:
+        raise argparse.ArgumentTypeError(f"must be a name of 1 to {most} letters, is {shown(text)}")
     return text
 
 

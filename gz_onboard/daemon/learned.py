@@ -19,10 +19,9 @@ from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.ageing import Learned
+from gz_onboard.estimator.consumption import Habits
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.snapshot import check_vehicle
-from gz_onboard.estimator.terrain import RATE, STRETCH
-from gz_onboard.estimator.usual import Usual
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -36,13 +35,10 @@ MEANING = {  # by name: what its factor is relative to
     "weak_capacity": "capacity of the weakest group, relative to the mean cell",
     "weak_resistance": "resistance of the weakest group, relative to the mean cell",
     "price": "energy per kilometre in motion, relative to the prior in the vehicle file",
-    "standing": "energy at stops, relative to the prior",
+    "stops": "energy at stops, relative to the prior",
     "pace": "time per kilometre, relative to the prior",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": f"change of height over {STRETCH / 1000:.0f} km of road, relative to the {sqrt(STRETCH * RATE):.0f} m "
-    "expected before the first ride",
 }
-TERRAIN = "terrain"
 RESETS = {"battery": ("battery",), "riding": ("riding",), "all": ("battery", "riding")}
 
 
@@ -132,22 +128,18 @@ def battery_learned(estimator: Estimator) -> dict[str, Learned]:
 
 
 def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
-    """Return the learned habits by rider and name; the last rider, whose part has the terrain, comes first."""
-    forecaster = estimator.forecaster
-    prior, terrain = forecaster.prior, forecaster.terrain
-    riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
-    found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
-    ratio = sqrt(terrain.rate / RATE)
-    found[forecaster.riders.now][TERRAIN] = Learned(ratio, terrain.relative_sd * ratio, terrain.share)
-    return found
+    """Return the learned habits by rider and name; the last rider comes first."""
+    learner = estimator.forecaster.learner
+    riders = {learner.rider: learner.habits, **learner.other_riders}
+    return {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
 
 
-def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
+def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
     learned = {}
-    for field in fields(Usual):
-        habit, before = getattr(usual, field.name), getattr(prior, field.name)
-        sd, unknown = sqrt(habit.usual_variance), sqrt(before.usual_variance)
-        learned[field.name] = Learned(habit.usual / before.usual, sd / before.usual, max(1 - sd / unknown, 0.0))
+    for field in fields(Habits):
+        now, before = getattr(habits, field.name), getattr(prior, field.name)
+        sd, unknown = sqrt(now.level_variance), sqrt(before.level_variance)
+        learned[field.name] = Learned(now.level / before.level, sd / before.level, max(1 - sd / unknown, 0.0))
     return learned
 
 
@@ -155,9 +147,7 @@ def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[st
     """Describe the learned battery and riders for a terminal; an unnamed rider only if something is known."""
     lines = ["per cent learned: share of the initial uncertainty that is gone"]
     lines += [_line(name, x) for name, x in battery.items()]
-    lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]
-    for rider, found in riders.items():
-        habits = {name: x for name, x in found.items() if name != TERRAIN}
+    for rider, habits in riders.items():
         if len(riders) > 1:
             if not rider and not any(x.share for x in habits.values()):
                 continue

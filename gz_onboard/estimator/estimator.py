@@ -203,7 +203,7 @@ class Estimator:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, speeds, reading = self.plausibility.grades, self.plausibility.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        towed = self.forecaster.riding.towed  # then no energy of the bus shows a grade
+        towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
         before = grades.faulty
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._inputs.power_at(now, v, a))
@@ -218,7 +218,7 @@ class Estimator:
             self.forecaster.forget(max(UNLEARNED, self.plausibility.speeds.odometer.compared))
             self.explainer.forget(forgotten)
         if "auxiliary_current" in newly:
-            self.forecaster.auxiliaries.forget()
+            self.forecaster.learner.auxiliaries.forget()
         if newly & AGED_FROM:
             self.soc.ageing.unlearn()
 
@@ -239,7 +239,7 @@ class Estimator:
         self._activity.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
-        self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
+        self.forecaster.learner.auxiliaries.step(min(dt, self._timing.pause), measured)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
@@ -248,11 +248,11 @@ class Estimator:
         known = 0 < dt <= self._timing.pause and not unsure and self._activity.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
             still = 0.0 if dt <= self._timing.pause and self._activity.now is Activity.RIDING else dt
-            self.forecaster.pause(still)
+            self.forecaster.learner.pause(still)
             return
         power = reading.voltage * reading.current
         self.route.ride(dt, speed, power)
-        self.forecaster.ride(
+        self.forecaster.learner.ride(
             dt,
             speed,
             self.motion.grade,
@@ -271,7 +271,7 @@ class Estimator:
             return voltage * current
         if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
             return torque * turning
-        return power - self.forecaster.auxiliaries.total
+        return power - self.forecaster.learner.auxiliaries.total
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
@@ -368,7 +368,7 @@ class Estimator:
         if saved["cell_temperature"] is not None and age is not None and age < CELLS_KEEP:
             self._temperatures.cells = saved["cell_temperature"]
         self.soc.restore(read_saved(saved), age, self.soc.effects.read(saved["cell_effects"]))
-        self.forecaster.pause(NEW_DAY if age is None else age)
+        self.forecaster.learner.pause(NEW_DAY if age is None else age)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

@@ -26,7 +26,8 @@ from functools import cached_property
 from math import exp, sqrt
 
 from gz_onboard.constants import MILD
-from gz_onboard.estimator.forecast import PRIOR_FORM_FACTOR_SQUARED, Forecast, Forecaster
+from gz_onboard.estimator.consumption import CONSUMPTION
+from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import (
     AHEAD,
     ALTITUDE_DIGITS,
@@ -37,7 +38,6 @@ from gz_onboard.estimator.load_model import (
     EffectInputs,
 )
 from gz_onboard.estimator.pattern import Point
-from gz_onboard.estimator.ridden import MEMORY
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -166,14 +166,14 @@ class RangeExplainer:
     ) -> RangeState:
         """The state that the range of a `forecast` follows from; see `take`."""
         forecaster, pack = self._forecaster, self._new.own()
-        riding, health = forecaster.riding, forecaster.battery.health
+        learner, health = forecaster.learner, forecaster.battery.health
         pack.age(health.capacity, health.resistance)
         pack.weaken(health.weakest)
         known = forecast.range > 0 and forecast.energy > 0
-        points = forecaster.pattern.points()
+        points = learner.pattern.points()
         distance = sum(p.distance for p in points)
-        learned = min(max(1 - riding.usual.price.variance / forecaster.prior.price.variance, 0.0), 1.0)
-        heating = riding.factor * self._heating / forecast.power if forecast.power > 0 else 0.0
+        learned = learner.price_known
+        heating = learner.factor * self._heating / forecast.power if forecast.power > 0 else 0.0
         state = RangeState(
             time=now,
             ridden=ridden,
@@ -186,8 +186,8 @@ class RangeExplainer:
             battery=pack,
             air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
             mass=self._load.model.mass,
-            factor=forecaster.factor,
-            auxiliaries=forecaster.beside + heating,
+            factor=learner.consumption_factor,
+            auxiliaries=learner.auxiliary_factor + heating,
             points=points,
             points_share=learned * distance / (distance + CONFIG.pattern_m),
         )
@@ -205,7 +205,7 @@ class RangeExplainer:
             range=0.0,
             consumption=0.0,
             power=0.0,
-            form_factor_squared=PRIOR_FORM_FACTOR_SQUARED,
+            form_factor_squared=CONSUMPTION.form_factor_squared,
             soc=battery.window.of_cells(1.0),
             cells=MILD,
             battery=battery,
@@ -216,7 +216,7 @@ class RangeExplainer:
             rated=True,
         )
         consumption = prior.factor * sum(self._parts(state, state.air, state.mass).values())
-        expected = consumption * prior.speed, PRIOR_FORM_FACTOR_SQUARED
+        expected = consumption * prior.speed, CONSUMPTION.form_factor_squared
         lost = load.model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         cells = cells_ahead(battery, self._forecaster.cooling, (state.soc, MILD), MILD, expected, lost)
         state = replace(state, consumption=consumption, power=expected[0], cells=cells)
@@ -325,7 +325,7 @@ class RangeExplainer:
         way, self._ridden = ridden - self._ridden, ridden
         known = [power for heater in self._heaters if (power := heater.get(now)) is not None]
         if way > 0 and known:
-            self._heating += (1 - exp(-way / MEMORY)) * (sum(known) - self._heating)
+            self._heating += (1 - exp(-way / CONSUMPTION.memory_m)) * (sum(known) - self._heating)
 
 
 def _split(causes: Sequence[Cause], value: Callable[[Collection[Cause]], float]) -> Parts:

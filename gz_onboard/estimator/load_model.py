@@ -1,20 +1,19 @@
-"""The forward model on board: its inputs, from what is known, and their typical values.
+"""Forward model of the load on board: its inputs, as far as they are known, and typical values for the others.
 
-Effects of an extended model read more than speed, acceleration and grade, which is all that is known of the road to
-come. What is modelled of the ride so far has the heading, the lateral acceleration and the vibration (the root mean
-square over each second) and the time moving as they were. What is expected of the rest of it has
-- of the heading nothing: the mean over all of them, so that a steady wind costs what it costs on a round trip;
-- the lateral acceleration and the vibration that the same segment had; before anything is ridden, or without IMU,
-  the prior's;
-- the time moving of half an hour on, as a range lasts an hour or so: tyres are warm then;
-- of memory nothing: effects are settled. Those in the cells take their voltage at the mean current.
+Effects of an extended model read more than speed, acceleration and grade. For the riding so far they get heading,
+lateral acceleration, vibration and time moving as measured. For the riding to come
+
+- the heading is unknown: the mean over all headings, so that a steady wind costs what it costs on a round trip;
+- lateral acceleration and vibration are those of the same riding, or the prior's before anything is ridden;
+- the time moving is half an hour more, as a range lasts an hour or so: tyres are warm then;
+- effects with memory are settled. Those in the cells take their voltage at the mean current.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import pi
 from typing import NamedTuple
 
@@ -25,14 +24,14 @@ from gz_onboard.physics.model import Model, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
 
 Quantities = dict[str, float]
-"""By name what effects read: see `physics.effect.QUANTITIES`."""
+"""Inputs of effects by name: see `physics.effect.QUANTITIES`."""
 AHEAD = 1800.0  # s: half of what a range lasts
 WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
-# rad: of a wind slower than the vehicle their mean is that of all, exactly
+# rad: for a wind slower than the vehicle their mean equals that of all headings
 HEADINGS = tuple(pi / 4 * i for i in range(8))
 USUAL_AIR = MILD, 0.0  # degC, m: of the usual force
-AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled anew for each degC and each 100 m
-KEPT_AIRS = 8  # and kept: a sensor at the edge of two goes to and fro
+AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled for each degC and each 100 m
+KEPT_AIRS = 8  # for which it is kept: a sensor at the edge of two goes to and fro
 BASE = {
     "speed",
     "acceleration",
@@ -50,7 +49,7 @@ BASE = {
 
 
 class Conditions(NamedTuple):
-    """What the consumption depends on beside the motion."""
+    """Conditions that the consumption depends on besides the motion."""
 
     ambient: float  # degC
     altitude: float  # m
@@ -58,7 +57,7 @@ class Conditions(NamedTuple):
 
 
 class EffectInputs(NamedTuple):
-    """What effects beyond the base's may read at one time; None where it is not known."""
+    """Inputs of effects beyond the base's at one time; None where unknown."""
 
     lateral_acceleration: float | None  # m/s²
     heading: float | None  # rad, clockwise from north
@@ -70,30 +69,31 @@ class EffectInputs(NamedTuple):
 
 @dataclass
 class Ledger:
-    """Where the energy of the riding went [J]: what was `measured`, and by effect what the model gives for it."""
+    """Where the energy of the riding went [J]: `measured`, and by effect as modelled."""
 
     measured: float = 0.0
     modelled: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
 class LoadModel:
-    """The model of one vehicle with what is usual for it.
+    """Forward model of one vehicle with the inputs that are typical for it.
 
-    `extended`: it reads `EffectInputs`. `ledger`: is kept of what is ridden if there is one; on board there is none.
+    extended: it reads `EffectInputs`; ledger: kept of the riding if there is one, which on board there is not; states:
+    of effects with memory between road and pack.
     """
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.model = model
         self.prior = prior
         self.ledger: Ledger | None = None
-        self.states: dict[str, float] = {}  # of effects with memory between road and pack
+        self.states: dict[str, float] = {}
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._battery = battery
         self._by_heading = "heading" in model.reads
-        self._prior_in: dict[tuple[float, float], tuple[float, float]] = {}  # by the air, the last few
+        self._prior_prices = lru_cache(KEPT_AIRS)(self._prior_prices_in)
 
     def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
-        """What the base model reads, on a level road without wind; speed [m/s], acceleration [m/s²]."""
+        """Inputs of the base model on a level road without wind; speed [m/s], acceleration [m/s²]."""
         return {
             "speed": speed,
             "acceleration": acceleration,
@@ -107,92 +107,72 @@ class LoadModel:
         }
 
     def extend(self, q: Quantities, inputs: EffectInputs, ambient: float, time_moving: float) -> None:
-        """Add to `q` what an extended model may read beside; `ambient` in degC, `time_moving` in s."""
-        lateral = inputs.lateral_acceleration
-        q["lateral_acceleration"] = self._typical_lateral(q["speed"]) if lateral is None else lateral
-        q["vibration"] = self.typical_vibration(q["speed"]) if inputs.vibration is None else inputs.vibration
-        q["heading"] = 0.0 if inputs.heading is None else inputs.heading
-        q["time_moving"] = time_moving
-        self._add_cells(q, inputs.soc, inputs.cell_temperature, inputs.current, ambient)
-
-    def typical_vibration(self, speed: float) -> float:
-        """The prior riding's [m/s²] at `speed` [m/s]: what is taken where it is not known."""
-        return self.prior.vibration if speed > MOVING else 0.0
-
-    def _typical_lateral(self, speed: float) -> float:
-        return self.prior.lateral_acceleration if speed > MOVING else 0.0
-
-    def _add_cells(self, q: Quantities, soc: float, temperature: float, current: float, ambient: float) -> None:
+        """Add to `q` the inputs of an extended model; ambient in degC, time_moving in s."""
+        lateral, typical = inputs.lateral_acceleration, self.prior.lateral_acceleration
+        if lateral is None:
+            lateral = typical if q["speed"] > MOVING else 0.0
         q |= {
+            "lateral_acceleration": lateral,
+            "vibration": self.typical_vibration(q["speed"]) if inputs.vibration is None else inputs.vibration,
+            "heading": 0.0 if inputs.heading is None else inputs.heading,
+            "time_moving": time_moving,
             "ambient_temperature": ambient,
-            "soc": soc,
-            "cell_temperature": temperature,
-            "cell_current": current / self._battery.cells_parallel,
-            "cell_capacity": self._battery.cell_capacity(temperature),
+            "soc": inputs.soc,
+            "cell_temperature": inputs.cell_temperature,
+            "cell_current": inputs.current / self._battery.cells_parallel,
+            "cell_capacity": self._battery.cell_capacity(inputs.cell_temperature),
         }
 
+    def typical_vibration(self, speed: float) -> float:
+        """Vibration of the prior riding [m/s²] at `speed` [m/s], where it is unknown."""
+        return self.prior.vibration if speed > MOVING else 0.0
+
     def power(self, q: Quantities) -> float:
-        """The power at the pack [W] with all effects settled."""
+        """Power at the pack [W] with all effects settled."""
         return float(sum(self.model.power(q).values()))
 
-    def power_ridden(self, q: Quantities, dt: float) -> float:
-        """The power [W] over the last `dt` [s] with all effects settled."""
-        return self._entered([self.model.power(q)], dt)
+    def power_ridden(self, q: Quantities, inputs: EffectInputs | None, dt: float) -> tuple[float, float]:
+        """(power [W] over the last `dt` [s], power of riding the same again); a step of effects with memory.
 
-    def _entered(self, ledgers: Sequence[Mapping[str, float]], dt: float) -> float:
-        """The mean power [W] of `ledgers` over the last `dt` [s], which `ledger` takes in."""
+        inputs: that `q` was extended by, None for the base's quantities alone.
+        """
+        if inputs and self._by_heading and inputs.heading is None:
+            ledgers = [self.model.power(q | {"heading": heading}) for heading in HEADINGS]
+        else:
+            ledgers = [self.model.power(q, stepping(self.states, dt) if inputs else None)]
         if self.ledger:
-            for ledger in ledgers:
-                for name, power in ledger.items():
-                    self.ledger.modelled[name] += power * dt / len(ledgers)
-        return float(sum(sum(ledger.values()) for ledger in ledgers)) / len(ledgers)
+            for name in ledgers[0]:
+                self.ledger.modelled[name] += sum(each[name] for each in ledgers) * dt / len(ledgers)
+        power = float(sum(sum(each.values()) for each in ledgers)) / len(ledgers)
+        return power, self.power_ahead(q | {"time_moving": q["time_moving"] + AHEAD}) if inputs else power
 
-    def power_with_memory(self, q: Quantities, heading_known: bool, dt: float) -> tuple[float, float]:
-        """The power [W] as it was, over the last `dt` [s], and as it is to be expected of riding the same again."""
-        to_come = self._over_headings(q | {"time_moving": q["time_moving"] + AHEAD})
-        if self._by_heading and not heading_known:
-            return self._entered(self._by_headings(q), dt), to_come
-        return self._entered([self.model.power(q, stepping(self.states, dt))], dt), to_come
-
-    def _by_headings(self, q: Quantities) -> list[dict[str, float]]:
-        """The ledger [W] with all settled, for each of `HEADINGS`."""
-        return [self.model.power(q | {"heading": heading}) for heading in HEADINGS]
-
-    def _over_headings(self, q: Quantities) -> float:
-        """The power [W] with all settled, in the mean over the headings if the model reads them."""
+    def power_ahead(self, q: Quantities) -> float:
+        """Power [W] with all effects settled, in the mean over all headings if the model reads the heading."""
         if not self._by_heading:
             return self.power(q)
-        return float(sum(sum(ledger.values()) for ledger in self._by_headings(q))) / len(HEADINGS)
+        return sum(self.power(q | {"heading": heading}) for heading in HEADINGS) / len(HEADINGS)
 
     def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
         """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
-        return sum(self._prior(ambient, altitude)), self.prior.speed
+        return sum(self.prior_prices(ambient, altitude)) * self.prior.speed, self.prior.speed
 
     def prior_prices(self, ambient: float, altitude: float) -> tuple[float, float]:
-        """What a metre of the prior riding costs in motion and by its stops [J/m]; see `prior_ride`."""
-        moving, standing = self._prior(ambient, altitude)
-        return moving / self.prior.speed, standing / self.prior.speed
+        """Energy per metre of the prior riding [J/m], in motion and at its stops; see `prior_ride`."""
+        return self._prior_prices(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS))
 
     def usual_force(self) -> float:
         """Mean force [N] of the prior riding: its energy at the pack over its distance."""
-        return self.prior.factor * sum(self._prior(*USUAL_AIR)) / self.prior.speed
+        return self.prior.factor * sum(self.prior_prices(*USUAL_AIR))
 
-    def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
-        """The mean power [W] of its motion and of its stops."""
-        at = round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)
-        found = self._prior_in.get(at)
-        if found is None:
-            powers = [0.0, 0.0]
-            for share, speed, acceleration in self.prior.points:
-                q = self.quantities(speed, acceleration, Conditions(*at))
-                if self.extended:
-                    settled = EffectInputs(None, None, HALF_FULL, at[0], 0.0)
-                    self.extend(q, settled, at[0], AHEAD)
-                    power = self._over_headings(q)
-                else:
-                    power = self.power(q)
-                powers[speed <= MOVING] += share * power * self.prior.unevenness
-            if len(self._prior_in) >= KEPT_AIRS:
-                self._prior_in.clear()
-            found = self._prior_in[at] = powers[0], powers[1]
-        return found
+    def _prior_prices_in(self, ambient: float, altitude: float) -> tuple[float, float]:
+        moving = standing = 0.0
+        for share, speed, acceleration in self.prior.points:
+            q = self.quantities(speed, acceleration, Conditions(ambient, altitude))
+            if self.extended:
+                self.extend(q, EffectInputs(None, None, HALF_FULL, ambient, 0.0), ambient, AHEAD)
+            price = share * self.power_ahead(q) * self.prior.unevenness / self.prior.speed
+            if speed > MOVING:
+                moving += price
+            else:
+                standing += price
+        return moving, standing

@@ -41,7 +41,7 @@ class ModelInputs:
         quantities = self._load.quantities(speed, acceleration, conditions)
         quantities["grade"] = grade
         if inputs := self.effect_inputs(now):
-            self._load.extend(quantities, inputs, conditions.ambient, self._forecaster.riding.time_moving)
+            self._load.extend(quantities, inputs, conditions.ambient, self._forecaster.learner.time_moving)
         return self._load.power(quantities)
 
     def power_of_prior(self, now: float) -> float:
@@ -66,7 +66,7 @@ class ModelInputs:
 
     def cell_inputs(self, now: float) -> dict[str, float]:
         """Inputs of effects in the cells, apart from those of the cells themselves."""
-        inputs = {"time_moving": self._forecaster.riding.time_moving}
+        inputs = {"time_moving": self._forecaster.learner.time_moving}
         return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
 
     def vibration(self, now: float) -> float:

@@ -195,15 +195,15 @@ class RouteForecaster:
         """Have `route` from now on, or none."""
         self._route, self.costs, self._segment = route, None, None
         self._distance, self._heights = self._motion.distance, HeightCheck()
-        self._forecaster.calm.show_next()
+        self._forecaster.smoother.show_next()
         self.outlook = RouteOutlook(RouteState.OFF if route else RouteState.NONE)
         self.hills = 0.0, 0.0
 
     def ride(self, dt: float, speed: float, power: float) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
-        if self._segment and not self._forecaster.riding.towed:
+        if self._segment and not self._forecaster.learner.towed:
             self._ridden += abs(speed) * dt
-            self._energy += (power - self._forecaster.auxiliaries.now) * dt
+            self._energy += (power - self._forecaster.learner.auxiliaries.now) * dt
 
     def forecast(
         self, now: float, free: Forecast, soc: tuple[float, float], loss_variance: float, air: Conditions
@@ -219,7 +219,7 @@ class RouteForecaster:
         self._move(now, route)
         on = route.position.on and not self._heights.contradicts
         if on is not (self.outlook.route_state is RouteState.ON):  # what is shown now stands on something else
-            self._forecaster.calm.show_next(on_route=on)
+            self._forecaster.smoother.show_next(on_route=on)
         if not on:
             self._segment, self.outlook, self.hills = None, RouteOutlook(RouteState.OFF), (0.0, 0.0)
             return free
@@ -230,10 +230,10 @@ class RouteForecaster:
             or abs(air.altitude - costs.air.altitude) > config.altitude_step
         ):
             if costs is None:
-                riding = self._forecaster.riding
-                self.cost = riding.factor
-                self.variance = riding.factor_variance + (config.initial_sd * riding.factor) ** 2
-            self.costs = costs = route.costs(self._forecaster.load, air, self._forecaster.riding.time_moving)
+                learner = self._forecaster.learner
+                self.cost = learner.factor
+                self.variance = learner.habits.factor.variance + (config.initial_sd * learner.factor) ** 2
+            self.costs = costs = route.costs(self._forecaster.load, air, self._forecaster.learner.time_moving)
         self._learn(route, costs)
         return self._ahead(route, costs, free, soc, loss_variance)
 
@@ -283,7 +283,7 @@ class RouteForecaster:
     ) -> Forecast:
         here, config = route.position.along, CONFIG
         left = route.length - here
-        cost = self.cost + self._forecaster.beside
+        cost = self.cost + self._forecaster.learner.auxiliary_factor
         variance = self.variance / cost**2 + config.ahead_sd**2 + loss_variance
         level = cost * route.between(costs.level, here, route.length)
         needed = level + route.between(costs.height, here, route.length)

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.riders import LONGEST_NAME
+from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.lab.estimate_log import EstimateTask
 from gz_onboard.lab.estimate_ride import open_estimate, vehicle_of
 from gz_onboard.lab.estimate_state import OVERTAKEN, StateAt, when
@@ -49,8 +49,9 @@ def state_at(file: Path, source: Path | SignalTable, span: Span) -> StateAt:
     if span.begin_ns < FIRST_DATE_NS:
         raise undated([source.name if isinstance(source, SignalTable) else source])
     rider = "" if isinstance(source, SignalTable) else str(facts_of(source).get("rider", ""))
-    if len(rider) > LONGEST_NAME:
-        raise InputError(f"{source}: rides.json: rider {rider!r}: must have at most {LONGEST_NAME} letters")
+    most = CONSUMPTION.most_name_letters
+    if len(rider) > most:
+        raise InputError(f"{source}: rides.json: rider {rider!r}: must have at most {most} letters")
     return StateAt(file, span.begin_ns, rider)
 
 

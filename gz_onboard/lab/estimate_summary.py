@@ -133,8 +133,8 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     counted = gauge.first is not None and gauge.uncounted <= MOST_SLOW * (last.time - tally.paused)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
-    drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
-    way = pipeline.drawn.distance
+    drawn = pipeline.energy.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
+    way = pipeline.energy.distance
     return RideSummary(
         file=str(ridden.source),
         log=str(log) if log else None,
@@ -146,10 +146,10 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         distance_km=last.distance * 1e-3,
         speed_max_km_h=times(tally.speed_max, 3.6),
         energy_wh=times(drawn, 1 / WH),
-        energy_recovered_wh=None if drawn is None else pipeline.drawn.recovered / WH,
-        energy_charged_wh=None if drawn is None else pipeline.drawn.charged / WH,
+        energy_recovered_wh=None if drawn is None else pipeline.energy.recovered / WH,
+        energy_charged_wh=None if drawn is None else pipeline.energy.charged / WH,
         energy_distance_km=way * 1e-3,
-        energy_missing_s=round(pipeline.drawn.missing, 1),
+        energy_missing_s=round(pipeline.energy.missing, 1),
         consumption_wh_km=times(drawn, 1 / way / WH_PER_KM) if way >= 100 else None,
         soc_start=soc_start[0],
         soc_start_sd=soc_start[1],

@@ -315,23 +315,23 @@ class Battery:
         temperature: float,
         form_factor_squared: float = 1.0,
         overpotential: Overpotential | None = None,
+        guess: float | None = None,
     ) -> float | None:
         """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
 
         form_factor_squared: the mean square of the current over the square of its mean: in traffic the current comes
         in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: voltage that a cell
-        loses beyond R0 and the RC pair.
+        loses beyond R0 and the RC pair. guess: a current [A] within some per cent, which saves an iteration.
         """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc, temperature)[0]
         cell = form_factor_squared * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
         resistance = n * cell / m + form_factor_squared * self.series_resistance
-        current = current_of(power, source, resistance)
+        current = current_of(power, source, resistance) if guess is None or overpotential is None else guess
         if overpotential is None:
             return current
-        for _ in range(2):  # it moves the current by a percent, and that moves it by a percent of itself
+        for _ in range(2 if guess is None else 1):  # it moves the current by a percent, and that moves it by a percent
             if current is not None:
-                current = current_of(
-                    power, source - n * overpotential(current / m, soc, temperature, form_factor_squared), resistance
-                )
+                lost = overpotential(current / m, soc, temperature, form_factor_squared)
+                current = current_of(power, source - n * lost, resistance)
         return current

@@ -44,7 +44,7 @@ def ride(
                 x, stood = x + 2.0, 0.0
         grade = hills if x % 1000.0 < 500.0 else -hills
         q = f.load.quantities(v, a, air) | {"grade": grade}
-        f.ride(1.0, v, grade, factor * f.load.power(q), air)
+        f.learner.ride(1.0, v, grade, factor * f.load.power(q), air)
         x += v
         v = min(max(v + a, 0.0), speed)
     return x
@@ -190,7 +190,7 @@ def test_bends_of_a_model_that_knows_their_loss_are_named():
     for each, lateral in ((f, 0.0), (curvy, 3.0)):
         inputs = EffectInputs(lateral, 0.0, 0.7, 20.0, 5.0)
         for _ in range(600):
-            each.ride(1.0, 10.0, 0.0, each.load.power(each.load.quantities(10.0, 0.0, MILD)), MILD, inputs)
+            each.learner.ride(1.0, 10.0, 0.0, each.load.power(each.load.quantities(10.0, 0.0, MILD)), MILD, inputs)
     why = against(curvy, f)
     check_sum(why)
     assert why.causes[Cause.TURNING] < -500.0
@@ -214,7 +214,7 @@ def test_a_heater_is_told_from_what_nobody_knows():
     for second in range(900):
         v = 10.0
         signals.heater_power.value, signals.heater_power.time = heater, float(second)
-        f.ride(1.0, v, 0.0, f.load.power(f.load.quantities(v, 0.0, MILD)) + heater, MILD)
+        f.learner.ride(1.0, v, 0.0, f.load.power(f.load.quantities(v, 0.0, MILD)) + heater, MILD)
         x += v
         result = f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0)
         explainer.take(float(second), result, 0.7, MILD, x)
@@ -302,16 +302,14 @@ def test_what_was_ridden_survives_a_restart():
     saved = json.loads(json.dumps(f.snapshot()))
     again = forecaster()
     again.restore(saved)
-    assert again.pattern.points() == f.pattern.points()
-    del saved["pattern"]  # of an earlier version
-    again.restore(saved)
+    assert again.learner.pattern.points() == f.learner.pattern.points()
     check_sum(explained(again))
 
 
 @pytest.mark.parametrize("rows", [[[1, 2]], [[3, 2, *[-1.0] * 8]], [[3, 2, *[1e300] * 8]], [["a"]], 7])
 def test_a_damaged_pattern_is_refused_whole(rows):
     f = ridden()
-    before = f.pattern.points()
+    before = f.learner.pattern.points()
     with pytest.raises((ValueError, TypeError)):
         f.restore(f.snapshot() | {"pattern": rows})
-    assert f.pattern.points() == before
+    assert f.learner.pattern.points() == before

@@ -106,11 +106,14 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
     saved = json.loads(json.dumps(e.snapshot("a")))
     fresh = estimator(SENSED)
     fresh.restore(saved, "a", 60.0)
-    assert fresh.forecaster.auxiliaries.mean == e.forecaster.auxiliaries.mean == pytest.approx(355.0, abs=20)
-    assert fresh.forecaster.factor == pytest.approx(e.forecaster.factor, rel=0.05)
-    del saved["riding"]["auxiliaries"]  # of an older version
-    fresh.restore(saved, "a", 60.0)
-    assert fresh.forecaster.auxiliaries.mean == 0.0
+    assert (
+        fresh.forecaster.learner.auxiliaries.mean
+        == e.forecaster.learner.auxiliaries.mean
+        == pytest.approx(355.0, abs=20)
+    )
+    assert fresh.forecaster.learner.consumption_factor == pytest.approx(
+        e.forecaster.learner.consumption_factor, rel=0.05
+    )
 
 
 def test_of_a_thermostat_its_mean_is_to_come():
@@ -156,10 +159,10 @@ def test_a_plug_that_says_yes_for_ever_does_not_stop_the_learning():
 def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(400, 10.0), scooter)
-    riding = e.forecaster.riding
+    learner = e.forecaster.learner
 
     def ridden():
-        return sum(segment.duration for segment in riding.segments) + riding.current.duration
+        return learner.state.sums.duration + learner._segment.duration
 
     before = ridden()
     follow(e, scooter.live(60), scooter)
@@ -547,10 +550,10 @@ def test_a_sensor_that_twitches_at_standstill_is_no_motion():
     follow(e, scooter.live(20), scooter)
     follow(e, scooter.live(540, 10.0), scooter)
     follow(e, scooter.live(130), scooter)
-    duration = e.forecaster.riding.current.duration
+    duration = e.forecaster.learner._segment.duration
     twitching = ((t, g, (4.0,) if g == MOTOR and t % 60 < 0.1 else v) for t, g, v in scooter.live(1200))
     follow(e, twitching, scooter)
-    assert e.forecaster.riding.current.duration == duration
+    assert e.forecaster.learner._segment.duration == duration
 
 
 def test_a_charge_that_pauses_says_no_time_until_full():
@@ -608,13 +611,13 @@ def test_a_state_of_charge_begun_anew_ends_what_was_held_back_of_the_range():
     """As of a pack that was swapped: no gap of the one before; what the filter learns by and by leaves it."""
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(300, 10.0), scooter)
-    calm = e.forecaster.calm
-    calm.gap = 4000.0
+    smoother = e.forecaster.smoother
+    smoother.gap = 4000.0
     follow(e, scooter.live(1, 10.0), scooter)
-    assert calm.gap > 3000
+    assert smoother.gap > 3000
     e.filter.soc = scooter.soc = 0.3
     follow(e, scooter.live(2, 10.0), scooter)
-    assert abs(calm.gap) < 300
+    assert abs(smoother.gap) < 300
 
 
 def test_a_long_stop_is_parking_and_a_bus_that_falls_silent_then_is_asleep():

@@ -80,12 +80,12 @@ def test_a_lone_speed_that_contradicts_the_odometer_is_named(name, step):
 def test_what_was_learned_from_a_doubled_speed_is_unlearned():
     scooter, e = Scooter(soc=0.9), estimator()
     follow(e, scooter.live(60), scooter)
-    before = e.forecaster.riding.factor
+    before = e.forecaster.learner.factor
     doubled = ((t, g, (2 * (v[0] or 0.0),) if g == MOTOR else v) for t, g, v in scooter.live(400, 10.0))
     _, end = follow(e, doubled, scooter)[-1]
     assert "motor_speed" in end.distrusted
     assert end.speed is None
-    assert e.forecaster.riding.factor == before
+    assert e.forecaster.learner.factor == before
 
 
 def test_a_speed_of_zero_with_the_current_of_a_drive_is_no_standing():

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp
 
 import pytest
 
 from gz_onboard.estimator.gate import CONTRADICTED, GATE_COUNT, InnovationGate
 from gz_onboard.estimator.initial import STEADY_AFTER, STEADY_TIME, STEADY_WAIT, SteadyVoltage
 from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
-from gz_onboard.estimator.ridden import MEMORY, Past, Segment
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, HISTORY_TIME, ChargeUncertainty, VoltageUncertainty
@@ -29,17 +27,6 @@ def everything(now: float = 0.0) -> Signals:
     for role in ROLES:
         signals[role].time, signals[role].value = now, 3.0
     return signals
-
-
-def test_past_segments_count_less_the_further_back_they_are():
-    near, far = Segment(250.0, 25.0, 900.0, 1.0, 800.0, 700.0), Segment(250.0, 50.0, 500.0, 1.0, 400.0, 300.0)
-    past = Past.of([near, far])
-    share = exp(-250.0 / MEMORY)
-    assert past.whole == 500.0
-    assert past.level == pytest.approx(700.0 + share * 300.0)
-    assert past.duration == pytest.approx(25.0 + share * 50.0)
-    assert past.recent_factor == 1.0, "not yet a kilometre"
-    assert Past.of([near] * 4).recent_factor == pytest.approx(900.0 / 800.0)
 
 
 def test_a_glitch_is_not_used_and_what_persists_is():

@@ -116,7 +116,7 @@ def test_another_route_begins_from_the_consumption_factor():
     assert rider.forecast.cost > 2.0
     rider.forecast.follow(rider.forecast.prepare(way(20e3)))
     rider.ask()
-    assert rider.forecast.cost == rider.forecaster.riding.factor
+    assert rider.forecast.cost == rider.forecaster.learner.factor
 
 
 def test_a_route_shows_at_once_and_so_does_its_end():
@@ -249,10 +249,10 @@ def test_off_the_route_it_is_as_without_one_and_comes_back():
 
 def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
     rider = Rider(way(5e3))
-    calm, answers = rider.forecaster.calm, []
+    answers = []
     for k in range(600):  # its end is reached after 5 km
         rider.ride(1, 1000.0)
-        calm.ride(11.0)
+        rider.forecaster.learner.distance += 11.0
         free = replace(FREE, range=2 * FREE.range)
         found = rider.ask(free if k > 300 else FREE)
         answers.append((rider.forecast.outlook.route_state, found.range, rider.forecaster.shown(found).range))
@@ -265,13 +265,13 @@ def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
 def test_what_a_route_made_of_the_range_is_not_kept_over_a_restart():
     """Which forgets the route: the next day's range is that without, not yesterday's with a descent."""
     rider = Rider(way(20e3))
-    calm = rider.forecaster.calm
+    smoother = rider.forecaster.smoother
     rider.settled()
-    calm.gap = 9e3
-    assert calm.snapshot() == {"gap": 0.0, "forecast": None}
+    smoother.gap = 9e3
+    assert smoother.snapshot() == {"gap": 0.0, "forecast": None}
     rider.forecast.follow(None)
     rider.forecaster.shown(rider.ask())
-    assert calm.snapshot()["forecast"] == [FREE.range, FREE.energy]
+    assert smoother.snapshot()["forecast"] == [FREE.range, FREE.energy]
 
 
 @pytest.mark.parametrize("slope", [-0.05, 0.05])

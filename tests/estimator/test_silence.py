@@ -51,7 +51,7 @@ def test_a_seldom_speed_does_not_make_the_riding_cheaper():
                     continue
                 last = event[0]
             e.handle(event)
-        factors.append(e.forecaster.riding.factor)
+        factors.append(e.forecaster.learner.factor)
     assert factors[1] == pytest.approx(factors[0], rel=0.04)
 
 
@@ -206,8 +206,7 @@ def test_whatever_was_saved_what_is_published_can_be(make, wrong):
     follow(e, scooter.live(30), scooter)
     follow(e, scooter.live(300, 10.0), scooter)
     saved = json.loads(json.dumps(e.snapshot("key")))
-    for part in "segments", "pattern":
-        del saved["riding"][part][2:]
+    del saved["riding"]["pattern"][2:]
     events = [*scooter.live(4), *scooter.live(2, 8.0)]
     taken = 0
     for path, value in numbers(saved):

@@ -5,13 +5,11 @@ from __future__ import annotations
 from math import sqrt
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain, restored_terrain
-from gz_onboard.estimator.usual import SEGMENT
+from gz_onboard.estimator.consumption import CONSUMPTION, Terrain
 
 NEW = Terrain()
+RATE, STRETCH, SEGMENT = CONSUMPTION.terrain_rate, CONSUMPTION.stretch_m, CONSUMPTION.segment_m
 
 
 def ridden(climbs: list[float], terrain: Terrain = NEW, unseen: float = 0.0) -> Terrain:
@@ -60,29 +58,3 @@ def test_no_road_is_as_steep_as_a_faulty_sensor_says():
 def test_on_a_short_way_a_slope_goes_on():
     assert sqrt(Terrain().variance(200.0)) == pytest.approx(2 * sqrt(Terrain().variance(100.0)))
     assert Terrain().variance(2 * STRETCH) == pytest.approx(2 * Terrain().variance(STRETCH))
-
-
-@given(st.lists(st.tuples(st.floats(1, 2000), st.floats(-500, 500), st.floats(0, 1)), max_size=60))
-def test_any_riding_gives_a_state_that_can_be_kept(segments):
-    terrain = Terrain()
-    for way, climb, unseen in segments:
-        terrain = terrain.ridden(way, climb, unseen * way)
-        assert terrain.rate > 0
-        assert restored_terrain(terrain.snapshot()) == terrain
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"squares": -1.0},
-        {"squares": float("nan")},
-        {"squares": 1e7},  # of no stretch
-        {"stretches": 1e9},
-        {"climb": float("inf")},
-        {"way": "far"},
-        {"way": 1e9, "climb": 1e8},
-    ],
-)
-def test_a_damaged_state_is_refused(damage):
-    with pytest.raises((KeyError, TypeError, ValueError)):
-        restored_terrain(Terrain().snapshot() | damage)

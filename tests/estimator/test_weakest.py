@@ -86,7 +86,7 @@ def ridden(kind: Hidden, until: float, lie: Lie | None = None, saved: dict[str, 
         estimator.restore(json.loads(json.dumps(saved)), "key", None)
     pack = packs()[kind]
     end = pack.time[int(np.argmax(pack.soc <= until))]
-    with patch.object(outlook, "PERIOD", SELDOM):
+    with patch.object(outlook, "OUTLOOK", outlook.OutlookConfig(period_s=SELDOM)):
         for event in heard(kind, lie):
             if event[0] > end:
                 break

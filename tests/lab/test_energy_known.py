@@ -61,8 +61,8 @@ def test_what_was_ridden_without_a_voltage_is_in_neither():
     assert summary.energy_missing_s == pytest.approx(END - BEGIN - 1, abs=0.5)  # it is held for a second
     assert summary.distance_km - summary.energy_distance_km == pytest.approx(ridden_without * 1e-3, abs=0.02)
     assert summary.energy_wh is not None
-    assert whole.pipeline.drawn.net is not None
-    assert summary.energy_wh < 0.9 * whole.pipeline.drawn.net / 3600
+    assert whole.pipeline.energy.net is not None
+    assert summary.energy_wh < 0.9 * whole.pipeline.energy.net / 3600
     assert summary.consumption_wh_km == pytest.approx(summary.energy_wh / summary.energy_distance_km)
     assert f"{summary.energy_missing_s:.1f} s without a credible voltage or current" in energy_line(summary)
     assert f"of {summary.energy_distance_km:.2f} km" in energy_line(summary)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
-from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
+from gz_onboard.physics.drawable import DISCHARGE, drawable
 from gz_onboard.physics.effect import Port, load_effect
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import Model, first_soc
@@ -133,7 +133,7 @@ def discharge(soc, temperature, power, *, burst=1.0, dt=1.0):
         if burst == 1.0 and voltage < battery.cutoff_voltage * n:
             return energy
         # With bursts the vehicle holds back the highest of them: it ends where a load near the mean meets the cut-off.
-        end = (1 + GIVES_UP * math.sqrt(burst - 1)) * power
+        end = (1 + DISCHARGE.give_up_load * math.sqrt(burst - 1)) * power
         mean = battery.settled_current(end, soc, temperature)
         if burst > 1.0 and (mean is None or end / mean < battery.cutoff_voltage * n):
             return energy
@@ -203,7 +203,7 @@ def test_drawable_is_sane(soc, temperature, power):
 
 @given(st.floats(10, 45), st.floats(300, 1200), st.floats(1.2, 3.0))
 def test_bursts_end_it_before_the_mean_load_would(temperature, power, form_factor_squared):
-    """At a load that is above its mean by `GIVES_UP` of its sd, which is known to `GIVES_UP_SD` of that."""
+    """At a load that is above its mean by `give_up_load` of its sd, which is known to `give_up_load_sd` of that."""
     low, high = 0.0, 1.0
     for _ in range(30):
         middle = (low + high) / 2
@@ -215,10 +215,10 @@ def test_bursts_end_it_before_the_mean_load_would(temperature, power, form_facto
         current = BATTERY.settled_current(load * power, soc, temperature)
         return load * power / current if current else 0.0  # more than the pack can give
 
-    end = 1 + GIVES_UP * sd
+    end = 1 + DISCHARGE.give_up_load * sd
     assert voltage(low - 1e-6, end) < cutoff
     assert voltage(high + 1e-6, end) >= cutoff
-    lower = voltage(high, end) - voltage(high, end + GIVES_UP_SD * sd)
+    lower = voltage(high, end) - voltage(high, end + DISCHARGE.give_up_load_sd * sd)
     found = drawable(BATTERY, high + 0.05, temperature, power, form_factor_squared)
     if lower < 0.3 * cutoff:
         assert found.end_drop_sd == pytest.approx(lower / BATTERY.cells_series, rel=0.4)

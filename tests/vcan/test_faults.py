@@ -19,8 +19,6 @@ import pytest
 
 from gz_onboard import state
 from gz_onboard.bus.recorder import is_complete
-from gz_onboard.estimator.ridden import Riding
-from gz_onboard.estimator.usual import restored_usual
 from gz_onboard.events import EFF_FLAG, State
 from gz_onboard.lab.estimate_ride import feed
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
@@ -127,7 +125,8 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     assert killed_ns - frames[-1][0] < (3 + 4 * max(held_up)) * S  # what is lost: 2 s on a machine that has the time
     first_log = daemon.logs[-1]
     rows = daemon.estimates(first_log)
-    factor = Riding(restored_usual(snapshot["riding"]["usual"])).factor
+    habit = snapshot["riding"]["state"]["habits"]["factor"]
+    factor = habit["level"] + habit["deviation"]
     assert rows[-1]["consumption_factor"] == pytest.approx(factor, abs=0.03)
     assert rows[-1]["consumption_factor_sd"] < 0.08  # the prior has 0.085
 

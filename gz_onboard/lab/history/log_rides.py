@@ -13,7 +13,7 @@ from typing import Any
 
 from gz_onboard.bus.publisher import KNOWN
 from gz_onboard.constants import WH
-from gz_onboard.estimator.drawn import Drawn
+from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.events import Activity, RouteState, State
 from gz_onboard.lab.history.ride import SECOND_NS, KeptRide
 from gz_onboard.lab.logged import Logged, is_estimate, is_number, is_status
@@ -63,13 +63,16 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[LogMome
     """(the estimates of a log with their statuses, the explanations); samples: topic, time [ns], values."""
     moments: list[LogMoment] = []
     whys: list[Logged] = []
-    drawn = Drawn(_LONGEST_STEP)
+    energy = EnergyCounter(_LONGEST_STEP)
     for topic, time_ns, values in samples:
         if topic == ESTIMATE_TOPIC and is_estimate(values):
-            drawn.add(values["time"], values.get("pack_voltage"), values.get("pack_current"), values["distance"])
+            energy.add(values["time"], values.get("pack_voltage"), values.get("pack_current"), values["distance"])
             ride = {key: values[key] for key in ("time", "distance")}
-            ride |= {"energy": drawn.net, "energy_recovered": drawn.recovered}  # of a log whose status does not say it
-            ride |= {"energy_distance": drawn.distance}
+            ride |= {
+                "energy": energy.net,
+                "energy_recovered": energy.recovered,
+            }  # of a log whose status does not say it
+            ride |= {"energy_distance": energy.distance}
             estimate = {key: values.get(key) for key in _USED}
             moments.append(LogMoment(time_ns, estimate, moments[-1].status if moments else {}, ride))
         elif topic == STATUS_TOPIC and moments and is_status(values):

@@ -9,7 +9,7 @@ from typing import Any
 
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.estimator.ageing import Learned
-from gz_onboard.estimator.drawn import Drawn
+from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.events import Activity, Estimate, State
 from gz_onboard.log_rows import ESTIMATE_TOPIC, STATUS_TOPIC, declare, estimate_row, learned_row, ride_row
 from tests.support import S
@@ -60,7 +60,7 @@ def write_log(
     with file.open("wb") as stream:
         log = LogFile(stream, clock(begin[0]), {"vehicle": vehicle, "vehicle_key": f"{vehicle}|14s"})
         declare(log, ())
-        drawn = Drawn(STEP)
+        drawn = EnergyCounter(STEP)
         for part in told:
             moving = part.activity is Activity.RIDING
             for _ in range(part.seconds // STEP):

@@ -1,0 +1,721 @@
+"""Consumption of the riding: what a metre costs and how long it takes, learned for each rider.
+
+The riding is gathered by the second, and the seconds in segments of 250 m. Of each segment the pack's energy is
+compared with the forward model's, which gives four quantities (`Habits`). The first three are relative to the prior
+riding of the vehicle file in the same air, so that cold air or a high pass is not taken for a habit:
+
+- price: energy per metre in motion, less the energy that height and speed have stored;
+- stops: energy per metre at stops, in units of that price; one long wait must not look like expensive riding;
+- pace: time per metre, stops included;
+- factor: measured over modelled energy of the same motion, the error of the parameters.
+
+Each is one Kalman filter of a slow level and a faster deviation (`Quantity`). The price to expect, and the variance of
+its mean over the way ahead, follow from the filters' states. Power of auxiliaries is measured once, here, where a
+sensor shows it, and is kept out of all four: it is watts, and no price of a metre.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from math import exp, sqrt
+from typing import Any
+
+from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.motion import MOTION
+from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
+from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.effect import MOVING
+from gz_onboard.physics.effects.inertia import rotating_mass
+from gz_onboard.physics.model import Model
+from gz_onboard.physics.riding import PriorRiding
+
+
+@dataclass(frozen=True)
+class ConsumptionConfig:
+    """How fast the riding is learned. Variances and sd of `Habits` are relative, as these are."""
+
+    # Gathering
+    segment_m: float = 250.0  # one update of the filters; in town, neighbours of this length are hardly alike
+    memory_m: float = 12_000.0  # sums of the riding fade to 1/e over this
+    recent_m: float = 1000.0  # the same of what a rider calls recent consumption
+    prior_m: float = 3000.0  # riding that the prior riding counts for in the sums
+    history_segments: int = 40  # 10 km that a fault found later can be unlearned of
+    acceleration_limit: float = 15.0  # m/s²: no road gives more; a second that shows more is left out
+    ride_ends_s: float = 600.0  # standstill after which another ride begins
+    tyres_cool_s: float = 3600.0  # standstill after which tyres are cold
+    # Towing
+    driving_force: float = 0.003  # of the weight: a motor that takes less does not drive; tyres take thrice that
+    height_error_m: float = 3.0  # error of a climb that may explain how a vehicle moves without its motor
+    # Filters
+    fade_m: float = 50_000.0  # correlation length of a ride's deviation: 25 to 100 km err alike on 15 full discharges
+    walk_per_sqrt_m: float = 2.2e-4  # random walk of the level: a tenth in 200 km (tyres, clothes, seasons)
+    ride_share: float = 0.1  # weight of one ride in the variance from ride to ride: about the last ten count
+    least_sd: float = 0.005  # no riding is more even
+    outlier_sd: float = 4.0  # a segment that differs by more is a faulty sensor or a wait for a ferry, and is clipped
+    most: float = 10.0  # of any quantity; all are about 1, and a heated van in a jam takes 5 times what the model says
+    most_variance: float = 4.0
+    doubt: float = 1.25  # sd over the change that a faulty sensor taught: price and stops may err alike
+    # Priors: sd of the level, from ride to ride, and of a segment
+    level_sd: float = 0.15  # price of riders and roads of one kind of vehicle
+    price_scatter: float = 0.2 / PriorRiding.drift  # sd of a segment's price over that of rides
+    stops_sd: tuple[float, float, float] = (0.03, 0.01, 0.06)  # a wait of half a minute is 0.05 of the price
+    pace_sd: tuple[float, float, float] = (0.25, 0.1, 0.4)
+    factor_sd: tuple[float, float] = (0.03, 0.18)  # wind, tyres, luggage; a segment's, of eight commissioning rides
+    # Forecast of the riding
+    least_price: float = 0.2  # of the prior riding: no riding of any length consumes less
+    form_factor_squared: float = 2.5  # mean square of the power over its mean squared, of eight commissioning rides
+    form_factor_squared_limits: tuple[float, float] = (1.0, 6.0)  # the same, of any riding
+    height_walk: float = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km, where no sensor shows the grade
+    # Terrain
+    stretch_m: float = 4000.0  # over which a net climb is one sample
+    terrain_rate: float = 0.05  # m² per m, of the altitudes of 32 trips of a car, 0 to 0.24 each
+    terrain_weight: float = 2.0  # stretches that this prior counts for
+    terrain_memory: float = 50.0  # stretches
+    # Auxiliaries
+    auxiliary_mean_s: float = 180.0  # thermostats switch within this
+    # Riders
+    most_riders: int = 50
+    most_name_letters: int = 40
+
+
+CONSUMPTION = ConsumptionConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity of the riding: Kalman filter of a slow level and a faster deviation of the present ride from it.
+
+    The level is a random walk over metres, the deviation a first-order Gauss-Markov process (Ornstein-Uhlenbeck) that
+    begins with each ride, and a segment shows their sum with white scatter. The variance of the deviation is learned by
+    a step of expectation and maximisation with each ride (Shumway & Stoffer 1982).
+    """
+
+    level: float
+    level_variance: float
+    ride_variance: float  # of the deviation, from ride to ride
+    scatter: float  # variance of one segment
+    deviation: float = 0.0
+    deviation_variance: float = -1.0  # negative: as from ride to ride
+    covariance: float = 0.0  # of level and deviation
+
+    def __post_init__(self) -> None:
+        if self.deviation_variance < 0:
+            object.__setattr__(self, "deviation_variance", self.ride_variance)
+
+    @property
+    def now(self) -> float:
+        """Of the present riding."""
+        return self.level + self.deviation
+
+    @property
+    def variance(self) -> float:
+        """Of `now`."""
+        return self.level_variance + 2 * self.covariance + self.deviation_variance
+
+    @property
+    def known_from(self) -> float:
+        """Riding [m] whose mean alone would have the variance of `now`."""
+        return self.scatter * CONSUMPTION.segment_m / max(self.variance, 1e-6)
+
+    def learned(self, residual: float, distance: float, noise: float = 0.0) -> Quantity:
+        """State after `distance` [m] that differed from `now` by `residual`; noise: a variance besides the scatter."""
+        c = CONSUMPTION
+        fade = exp(-distance / c.fade_m)
+        walk = (c.walk_per_sqrt_m * self.level) ** 2 * distance
+        level = min(self.level_variance + walk, max(self.level_variance, c.most_variance))
+        both = fade * self.covariance
+        own = fade * fade * self.deviation_variance + (1 - fade * fade) * self.ride_variance
+        scatter = self.scatter * c.segment_m / distance
+        total = level + 2 * both + own + scatter + noise
+        most = c.outlier_sd * sqrt(total)
+        residual = min(max(residual + (1 - fade) * self.deviation, -most), most)
+        gain, own_gain = (level + both) / total, (both + own) / total
+        return Quantity(
+            min(max(self.level + gain * residual, -c.most), c.most),
+            level - gain * (level + both),
+            self.ride_variance,
+            self.scatter,
+            min(max(fade * self.deviation + own_gain * residual, -c.most), c.most),
+            own - own_gain * (both + own),
+            both - gain * (both + own),
+        )
+
+    def ahead(self, distance: float) -> tuple[float, float]:
+        """(mean over the next `distance` [m], its variance): of a Gauss-Markov process given now, and its scatter."""
+        lengths = max(distance, 1.0) / CONSUMPTION.fade_m
+        share = (1 - exp(-lengths)) / lengths
+        unknown = 2 * (1 - share) / lengths - share * share  # of the ride's variance
+        variance = self.level_variance + 2 * share * self.covariance + share * share * self.deviation_variance
+        variance += unknown * self.ride_variance + self.scatter * min(CONSUMPTION.segment_m / max(distance, 1.0), 1.0)
+        return self.level + share * self.deviation, variance
+
+    def next_ride(self) -> Quantity:
+        """State before another ride; the deviation of this one teaches how unlike rides are."""
+        c = CONSUMPTION
+        seen = self.deviation**2 + self.deviation_variance
+        ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
+        ride_variance = min(max(ride_variance, c.least_sd**2), c.most_variance)
+        return Quantity(self.level, self.level_variance, ride_variance, self.scatter)
+
+    def doubted(self, seen: float) -> Quantity:
+        """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
+        more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
+        return replace(self, deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
+
+    def of_another_rider(self) -> Quantity:
+        """State for a rider who has never ridden."""
+        return replace(self, level_variance=self.level_variance + CONSUMPTION.level_sd**2)
+
+    def scaled(self, by: float) -> Quantity:
+        """The same quantity in a unit that is `by` times smaller."""
+        numbers = asdict(self)
+        for name in ("level", "deviation"):
+            numbers[name] *= by
+        for name in ("level_variance", "ride_variance", "scatter", "deviation_variance", "covariance"):
+            numbers[name] *= by * by
+        return Quantity(**numbers)
+
+
+@dataclass(frozen=True, slots=True)
+class Habits:
+    """Riding of one rider. All but the factor are in units of the prior riding."""
+
+    price: Quantity
+    stops: Quantity
+    pace: Quantity
+    factor: Quantity
+
+    @classmethod
+    def before(cls, prior: PriorRiding, stops: float) -> Habits:
+        """Before anything is ridden; stops: of the prior riding."""
+        c = CONSUMPTION
+
+        def quantity(level: float, sd: float, ride_sd: float, scatter_sd: float) -> Quantity:
+            return Quantity(level, sd**2, ride_sd**2, scatter_sd**2)
+
+        scatter = max(c.price_scatter * prior.drift, c.least_sd)
+        return cls(
+            quantity(prior.factor, sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, scatter),
+            quantity(stops, *c.stops_sd),
+            quantity(1.0, *c.pace_sd),
+            quantity(prior.factor, prior.factor_sd, *c.factor_sd),
+        )
+
+    def next_ride(self) -> Habits:
+        """Before another ride."""
+        return Habits(*(quantity.next_ride() for quantity in self.all))
+
+    def doubted(self, seen: Habits) -> Habits:
+        """Without what a sensor in doubt has taught; `seen`: with it."""
+        return Habits(*(mine.doubted(its.now) for mine, its in zip(self.all, seen.all, strict=True)))
+
+    def scaled(self, price: float, pace: float) -> Habits:
+        """In units of a prior riding whose price and pace are so many times smaller."""
+        return Habits(
+            self.price.scaled(price), self.stops.scaled(price), self.pace.scaled(pace), self.factor.scaled(price)
+        )
+
+    @property
+    def all(self) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+        """In the order of the fields."""
+        return self.price, self.stops, self.pace, self.factor
+
+
+@dataclass(slots=True)
+class Segment:
+    """Sums over some riding; energies in J at the pack's terminals, without auxiliaries beyond the file's."""
+
+    distance: float = 0.0  # m
+    duration: float = 0.0  # s
+    measured: float = 0.0  # J, in motion
+    stops: float = 0.0  # J, measured at stops
+    auxiliary: float = 0.0  # J, of auxiliaries beyond the file's
+    squares: float = 0.0  # W²·s, of the measured power
+    modelled: float = 0.0  # J, in motion
+    level: float = 0.0  # J, modelled, less what height and speed have stored
+    unseen: float = 0.0  # m of which no sensor showed the grade
+    climb: float = 0.0  # m, of the rest
+
+    @property
+    def energy(self) -> float:
+        """All that was measured, with those auxiliaries [J]."""
+        return self.measured + self.stops + self.auxiliary
+
+    def faded(self, segment: Segment, memory: float) -> Segment:
+        """These sums, weighted down over a `memory` [m], with those of a `segment` that came after."""
+        fade = exp(-segment.distance / memory)
+        return Segment(*(fade * old + new for old, new in zip(astuple(self), astuple(segment), strict=True)))
+
+
+@dataclass(slots=True)
+class Second:
+    """What is gathered until the model is asked."""
+
+    start_speed: float | None = None  # m/s
+    seconds: float = 0.0
+    distance: float = 0.0  # m, negative backwards
+    unseen: float = 0.0  # m without a known grade
+    energy: float = 0.0  # J
+    motor: float = 0.0  # J of it into the motor
+    squares: float = 0.0  # W²·s
+    climb: float = 0.0  # m
+
+
+@dataclass(frozen=True, slots=True)
+class Terrain:
+    """How far roads climb or fall in the end, where no route tells the hills ahead.
+
+    A hill gives back what it took, but for losses, which are part of the price of a metre. The height at which a way
+    ends is unknown and grows as a random walk. Its rate is the mean square of the net climbs over stretches of 4 km,
+    with a prior.
+    """
+
+    squares: float = 0.0  # m²: net climbs squared, over the stretches that count
+    stretches: float = 0.0
+    way: float = 0.0  # m, of the present stretch
+    climb: float = 0.0  # m
+    unseen: float = 0.0  # m
+
+    @property
+    def rate(self) -> float:
+        """Variance of the height [m²] per metre of the way."""
+        weight, stretch = CONSUMPTION.terrain_weight, CONSUMPTION.stretch_m
+        prior = weight * CONSUMPTION.terrain_rate * stretch
+        return (prior + self.squares) / ((weight + self.stretches) * stretch)
+
+    def ridden(self, way: float, climb: float, unseen: float) -> Terrain:
+        """After `way` [m] that climbed by `climb` [m], except for `unseen` [m] of it without a known grade."""
+        stretch = CONSUMPTION.stretch_m
+        way, climb, unseen = self.way + way, self.climb + climb, self.unseen + unseen
+        if way < stretch:
+            return Terrain(self.squares, self.stretches, way, climb, unseen)
+        if unseen > way / 5 or abs(climb) > STEEPEST * way:
+            return Terrain(self.squares, self.stretches)
+        keep = 1 - 1 / CONSUMPTION.terrain_memory
+        return Terrain(keep * self.squares + climb * climb * stretch / way, keep * self.stretches + 1)
+
+    def variance(self, way: float) -> float:
+        """Of the height [m²] at which the next `way` [m] ends; on a short one the slope stays the same."""
+        return self.rate * way * min(way / CONSUMPTION.stretch_m, 1.0)
+
+
+class AuxiliaryPower:
+    """Power of auxiliaries beyond the vehicle file's, as their own current sensor shows it; 0 if none does.
+
+    At standstill the pack's power shows nothing: a motor that holds the vehicle on a hill looks like a heater.
+    """
+
+    def __init__(self, model: Model) -> None:
+        modelled = any(p.name == "auxiliary_power" for effect in model.effects for p in effect.parameters)
+        self._modelled = model.parameters["auxiliary_power"] if modelled else 0.0  # W
+        self.now = self.mean = 0.0  # W beyond that
+        self._seen = 0.0  # s that the mean is of
+
+    def step(self, dt: float, measured: float | None) -> None:
+        """Take in `dt` [s] of the power of all auxiliaries [W]; None: not measured."""
+        if measured is None:
+            self.now = self.mean
+            return
+        self.now = measured - self._modelled
+        self._seen = min(self._seen + dt, CONSUMPTION.auxiliary_mean_s)
+        if self._seen > 0:
+            self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
+
+    @property
+    def total(self) -> float:
+        """Power of all auxiliaries now [W]."""
+        return self._modelled + self.now
+
+    def forget(self) -> None:
+        """Drop what a faulty sensor has shown."""
+        self.now = self.mean = self._seen = 0.0
+
+    def snapshot(self) -> float:
+        """Mean power of all auxiliaries [W], to be kept over a restart."""
+        return self._modelled + self.mean
+
+    def restore(self, saved: float) -> None:
+        """Take `snapshot` until something is measured."""
+        self._seen = 0.0
+        self.now = self.mean = saved - self._modelled
+
+
+@dataclass(frozen=True, slots=True)
+class RidingState:
+    """What the learner has learned by the end of a segment."""
+
+    habits: Habits
+    sums: Segment = field(default_factory=Segment)  # faded over `memory_m`
+    recent: Segment = field(default_factory=Segment)  # faded over `recent_m`
+    terrain: Terrain = field(default_factory=Terrain)
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedRiding:
+    """The riding to come."""
+
+    consumption: float  # J/m
+    power: float  # W, mean
+    form_factor_squared: float  # mean square of the power over the square of its mean
+    variance: float  # of the consumption over the way to come, relative
+    least: float  # J/m: no riding takes less
+
+    @property
+    def load(self) -> tuple[float, float]:
+        """Mean power [W] and the square of its form factor."""
+        return self.power, self.form_factor_squared
+
+
+class ConsumptionLearner:
+    """Learns what the riding of one vehicle costs. `state` is replaced as a whole at the end of each segment."""
+
+    def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
+        self.load = LoadModel(model, battery, prior)
+        moving, stops = self.load.prior_prices(*USUAL_AIR)
+        self.prior_price = moving + stops  # J/m: with the prior's speed, the unit of saved habits
+        self.prior = Habits.before(prior, stops / moving)
+        self.state = RidingState(self.prior)
+        self.pattern, self.auxiliaries = Pattern(), AuxiliaryPower(model)
+        self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
+        self.distance = 0.0  # m ridden, without towed metres
+        self.rides = 0  # that have ended
+        self.time_moving = 0.0  # s, since the start or the last long standstill
+        self.still = 0.0  # s since the last motion
+        self.towed = False
+        self._coasted = self._unexplained = 0.0  # m without the motor, and J that nothing explains on them
+        self._segment, self._second = Segment(), Second()
+        self._history = deque[tuple[float, RidingState]](maxlen=CONSUMPTION.history_segments)
+        self._weight = model.mass * GRAVITY  # N
+        self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg
+
+    # --- results ------------------------------------------------------------------------------------------------
+
+    @property
+    def habits(self) -> Habits:
+        """Of the present rider."""
+        return self.state.habits
+
+    @property
+    def factor(self) -> float:
+        """Measured over modelled energy of the present riding, without auxiliaries beyond the file's."""
+        return min(max(self.habits.factor.now, 1 / CONSUMPTION.most), CONSUMPTION.most)
+
+    @property
+    def auxiliary_factor(self) -> float:
+        """Increase of the consumption factor by auxiliaries beyond the file's, at the pace of the present riding."""
+        least, speed = CONSUMPTION.least_price, self.load.prior.speed
+        modelled = self.prior_price * max(self.habits.price.now, least) / self.factor  # J/m
+        return self.auxiliaries.mean / speed * max(self.habits.pace.now, least) / modelled
+
+    @property
+    def consumption_factor(self) -> float:
+        """Measured over modelled energy of the present riding."""
+        return self.factor + self.auxiliary_factor
+
+    @property
+    def price_known(self) -> float:
+        """How much of the expected price the riding has taught, rather than the prior: 0 to 1."""
+        return min(max(1 - self.habits.price.variance / self.prior.price.variance, 0.0), 1.0)
+
+    @property
+    def recent_factor(self) -> float:
+        """Measured over modelled energy of about the last kilometre; 1 while that is not known."""
+        recent = self.state.recent
+        known = self.state.sums.distance >= CONSUMPTION.recent_m and recent.modelled > 0
+        return recent.measured / recent.modelled if known else 1.0
+
+    @property
+    def recent_consumption(self) -> float | None:
+        """Consumption over about the last kilometre, stops included [J/m]; None: too short a way."""
+        recent, now = self.state.recent, self._segment
+        if self.state.sums.distance + now.distance < CONSUMPTION.recent_m / 2:
+            return None
+        return (recent.energy + now.energy) / (recent.distance + now.distance)
+
+    @property
+    def mostly_prior(self) -> bool:
+        """Whether less was ridden than the prior riding counts for."""
+        return self.state.sums.distance + self._segment.distance < CONSUMPTION.prior_m
+
+    def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
+        """The riding on the next `way` [m]; ambient in degC, altitude in m."""
+        c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed
+        unit, standing = self.load.prior_prices(ambient, altitude)
+        price, price_variance = habits.price.ahead(way)
+        stops, stops_variance = habits.stops.ahead(way)
+        pace, pace_variance = habits.pace.ahead(way)
+        price, pace = max(price, c.least_price), max(pace, c.least_price)
+        extra = self.auxiliaries.mean / speed  # J/m, at the prior's pace
+        consumption = unit * (price + max(stops, 0.0)) + extra * pace
+        # Where no grade was seen the price is the model's times the factor, whose error is the same all the way.
+        unseen = sums.unseen / sums.distance if sums.distance else 0.0
+        price_variance += (unseen * price / self.factor) ** 2 * habits.factor.variance
+        height_variance = self._weight**2 * self.state.terrain.variance(way) / (consumption * way) ** 2
+        prior_power, prior_time = (unit + standing) * speed, c.prior_m / speed
+        # Downhill next to nothing is drawn in the mean; the way to come is not all downhill.
+        energy = prior_power * prior_time + max(sums.energy, self.consumption_factor * sums.level)
+        energy = max(energy, c.least_price * prior_power * prior_time)
+        squares = c.form_factor_squared * prior_power**2 * prior_time + sums.squares
+        low, high = c.form_factor_squared_limits
+        variance = ((price_variance + stops_variance) * unit**2 + pace_variance * extra**2) / consumption**2
+        return ExpectedRiding(
+            consumption,
+            consumption * speed / pace,
+            min(max(squares * (prior_time + sums.duration) / energy**2, low), high),
+            variance + height_variance,
+            least=c.least_price * unit,
+        )
+
+    # --- learning -----------------------------------------------------------------------------------------------
+
+    def ride(
+        self,
+        dt: float,
+        speed: float,
+        grade: float | None,
+        power: float,
+        conditions: Conditions,
+        inputs: EffectInputs | None = None,
+        period: float = 0.0,
+        motor_power: float | None = None,
+    ) -> bool:
+        """Take in `dt` [s] of riding at `speed` [m/s], `grade` (sine) and `power` [W] of the pack.
+
+        inputs: of an `extended` load model; period: of the speed's messages [s], as between two of them there is no
+        acceleration; motor_power: into the motor [W], None for all. Returns whether a segment was learned.
+        """
+        self._gather(dt, speed, grade, power, power if motor_power is None else motor_power)
+        second, segment, c = self._second, self._segment, CONSUMPTION
+        if second.seconds < max(1.0, period):
+            return False
+        start = speed if second.start_speed is None else second.start_speed
+        mean, acceleration = second.distance / second.seconds, (speed - start) / second.seconds
+        if abs(acceleration) > c.acceleration_limit:  # a sensor errs, or the wheel spins
+            self.pause()
+            return False
+        modelled, repeated = self._modelled(mean, acceleration, conditions, inputs)
+        stored = self._weight * second.climb + self._moving_mass * (speed * speed - start * start) / 2
+        auxiliary = self.auxiliaries.now * second.seconds
+        moving = abs(mean) > MOVING
+        if moving and grade is not None:
+            self._watch_towing(modelled - (repeated - stored + second.energy - auxiliary) / 2)
+            if self.towed:
+                self.pause()
+                return False
+        if self.load.ledger:
+            self.load.ledger.measured += second.energy
+        if moving:
+            self.still = 0.0
+            segment.measured += second.energy - auxiliary
+            segment.modelled += modelled
+            segment.level += repeated
+        else:
+            self._stand(second.seconds)
+        if self.still <= MOTION.stop_time:  # a longer stop takes energy, but teaches nothing
+            segment.stops += 0.0 if moving else second.energy - auxiliary
+            segment.auxiliary += auxiliary
+            segment.duration += second.seconds
+            segment.squares += second.squares
+        segment.level -= stored
+        segment.climb += second.climb
+        segment.unseen += second.unseen
+        segment.distance += abs(second.distance)
+        motion = mean, acceleration, inputs.lateral_acceleration if inputs else None
+        self.pattern.add(second.seconds, motion, second.distance, second.climb)
+        self._second = Second(start_speed=speed)
+        if segment.distance < c.segment_m:
+            return False
+        self._close(conditions)
+        return True
+
+    def _gather(self, dt: float, speed: float, grade: float | None, power: float, motor: float) -> None:
+        second, way = self._second, abs(speed) * dt
+        if second.start_speed is None:
+            second.start_speed = speed
+        second.seconds += dt
+        second.distance += speed * dt
+        second.energy += power * dt
+        second.motor += motor * dt
+        second.squares += power * power * dt
+        if grade is None:
+            second.unseen += way
+        else:
+            second.climb += grade * speed * dt
+        self.time_moving += dt if speed > MOVING else 0.0
+        self.distance += 0.0 if self.towed else way
+
+    def _modelled(
+        self, speed: float, acceleration: float, conditions: Conditions, inputs: EffectInputs | None
+    ) -> tuple[float, float]:
+        """(energy of the second by the model, energy of riding it again) [J]."""
+        second = self._second
+        q = self.load.quantities(speed, acceleration, conditions)
+        if abs(speed) > MOVING:
+            q["grade"] = max(min(second.climb / abs(second.distance), STEEPEST), -STEEPEST)
+        if inputs:
+            self.load.extend(q, inputs, conditions.ambient, self.time_moving)
+        then, again = self.load.power_ridden(q, inputs, second.seconds)
+        return then * second.seconds, again * second.seconds
+
+    def _watch_towing(self, unexplained: float) -> None:
+        """Unlearn the metres that something else has paid for: road and bus leave too much energy unexplained.
+
+        unexplained: of the second [J], what the model asks for beyond half of a level road's and of what was measured.
+        """
+        distance, limit = abs(self._second.distance), CONSUMPTION.height_error_m * self._weight
+        if self._second.motor > CONSUMPTION.driving_force * self._weight * distance:
+            self._unexplained = 0.0
+        else:
+            self._unexplained = min(max(self._unexplained + unexplained, 0.0), 2 * limit)
+        self._coasted = self._coasted + distance if self._unexplained else 0.0
+        before, self.towed = self.towed, self._unexplained > limit
+        if self.towed and not before:
+            self._revert(self._coasted)
+
+    def _close(self, conditions: Conditions) -> None:
+        """Learn from the segment that has ended."""
+        c, segment, state, speed = CONSUMPTION, self._segment, self.state, self.load.prior.speed
+        way, habits = segment.distance, state.habits
+        unit = self.load.prior_prices(conditions.ambient, conditions.altitude)[0] * way
+        unseen, factor = segment.unseen / way, habits.factor.now
+        paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
+        # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
+        # the grade) would draw the factor to 0. Hills that no sensor showed have stored an unknown energy.
+        weight = factor / (max(habits.price.now, c.least_price) * unit)
+        height = self._weight * c.height_walk * sqrt(segment.unseen)  # J
+        learned = Habits(
+            habits.price.learned(paid / unit - habits.price.now, way),
+            habits.stops.learned(segment.stops / unit - habits.stops.now, way),
+            habits.pace.learned(segment.duration * speed / way - habits.pace.now, way),
+            habits.factor.learned(weight * (segment.measured - factor * segment.modelled), way, (height * weight) ** 2),
+        )
+        self._history.append((way, state))
+        self.state = RidingState(
+            learned,
+            state.sums.faded(segment, c.memory_m),
+            state.recent.faded(segment, c.recent_m),
+            state.terrain.ridden(way, segment.climb, segment.unseen),
+        )
+        self.pattern.fade(exp(-way / c.memory_m))
+        self._segment = Segment()
+
+    def _revert(self, distance: float) -> None:
+        """Go back to the state before the last `distance` [m] or a little more, as far as it is known."""
+        distance -= self._segment.distance
+        self._segment = Segment()
+        while distance > 0 and self._history:
+            way, self.state = self._history.pop()
+            distance -= way
+
+    def forget(self, distance: float) -> None:
+        """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
+        seen = self.habits
+        self.pause()
+        self._revert(distance)
+        self.state = replace(self.state, habits=self.habits.doubted(seen))
+
+    def ridden_by(self, rider: str) -> None:
+        """Have `rider` ride from now on.
+
+        Who has never ridden is taken to ride as the one before, but less surely. What the parameters have wrong is the
+        vehicle's, whoever rides.
+        """
+        self.pause()
+        before = self.habits.next_ride()
+        self.other_riders[self.rider] = before
+        habits = self.other_riders.pop(rider, None)
+        if habits is None:
+            habits = replace(before, price=before.price.of_another_rider(), pace=before.pace.of_another_rider())
+            if len(self.other_riders) > CONSUMPTION.most_riders:
+                del self.other_riders[next(iter(self.other_riders))]
+        self.rider, self._segment, self.pattern = rider, Segment(), Pattern()
+        self._history.clear()
+        self.state = RidingState(replace(habits, factor=before.factor), terrain=self.state.terrain)
+
+    def pause(self, dt: float = 0.0) -> None:
+        """Take in `dt` [s] that teach nothing: parked, or something is not known. Drop the unfinished second."""
+        self._second = Second()
+        self._stand(dt)
+
+    def _stand(self, dt: float) -> None:
+        riding, self.still = self.still < CONSUMPTION.ride_ends_s, self.still + dt
+        if riding and self.still >= CONSUMPTION.ride_ends_s:
+            self.rides += 1
+            self.state = replace(self.state, habits=self.habits.next_ride())
+        if self.still >= CONSUMPTION.tyres_cool_s:
+            self.time_moving = 0.0
+
+    # --- saving -------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """State to be kept over a restart."""
+        return {
+            "unit": {"price": self.prior_price, "speed": self.load.prior.speed},
+            "state": asdict(self.state),
+            "rider": self.rider,
+            "riders": {name: asdict(habits) for name, habits in self.other_riders.items()},
+            "pattern": self.pattern.snapshot(),
+            "auxiliary_power": self.auxiliaries.snapshot(),
+            "effects": dict(self.load.states),
+            "still": self.still,
+            "time_moving": self.time_moving,
+        }
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Take a `snapshot`, which was checked against `FIELDS`; ValueError for habits that no riding teaches.
+
+        Habits are converted to the units of this vehicle file, which may have been calibrated since.
+        """
+        unit, state = saved["unit"], saved["state"]
+        scales = unit["price"] / self.prior_price, self.load.prior.speed / unit["speed"]
+        sums, recent, terrain = Segment(**state["sums"]), Segment(**state["recent"]), Terrain(**state["terrain"])
+        self.state = RidingState(_habits(state["habits"], scales), sums, recent, terrain)
+        self.rider = saved["rider"]
+        self.other_riders = {name: _habits(habits, scales) for name, habits in saved["riders"].items()}
+        self.pattern = restored_pattern(saved["pattern"])
+        self.auxiliaries.restore(saved["auxiliary_power"])
+        self.load.states = dict(saved["effects"])
+        self.still, self.time_moving = saved["still"], saved["time_moving"]
+        self._segment, self._second = Segment(), Second()
+        self._history.clear()
+
+
+def _habits(saved: Mapping[str, Mapping[str, float]], scales: tuple[float, float]) -> Habits:
+    """Habits out of `asdict` of them, scaled by price and pace; ValueError for a covariance that no filter has."""
+    habits = Habits(**{name: Quantity(**quantity) for name, quantity in saved.items()}).scaled(*scales)
+    for q in habits.all:
+        possible = all(abs(x) <= CONSUMPTION.most for x in astuple(q))
+        possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
+        if not possible or q.covariance**2 > q.level_variance * q.deviation_variance * (1 + 1e-9):
+            raise ValueError("is damaged: state.riding holds implausible habits")
+    return habits
+
+
+def _numbers(of: type, number: Number = FINITE) -> dict[str, Number]:
+    return dict.fromkeys((f.name for f in fields(of)), number)
+
+
+_HABITS = {quantity.name: _numbers(Quantity) for quantity in fields(Habits)}
+_POSITIVE = Number(0.0, 1e12)
+_SUMS = _numbers(Segment, Number(-1e12, 1e12)) | dict.fromkeys(("distance", "duration", "squares", "unseen"), _POSITIVE)
+FIELDS = {
+    "unit": dict.fromkeys(("price", "speed"), Number(1e-6, 1e6)),
+    "state": {
+        "habits": _HABITS,
+        "sums": _SUMS,
+        "recent": _SUMS,
+        "terrain": _numbers(Terrain, _POSITIVE) | {"climb": Number(-1e12, 1e12)},
+    },
+    "rider": Text(CONSUMPTION.most_name_letters),
+    "riders": Each(_HABITS, CONSUMPTION.most_riders),
+    "pattern": Each(Each(FINITE, 10), MOST_BINS),
+    "auxiliary_power": Number(-1e5, 1e5),  # W
+    "effects": Each(FINITE, 100),
+    "still": Number(0.0, 1e10),  # s
+    "time_moving": Number(0.0, 1e7),  # s
+}
+"""Of the saved state."""

@@ -1,0 +1,162 @@
+"""The filters of the learner: how well they know what they know."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.estimator.consumption import Habits, Quantity
+from gz_onboard.estimator.forecast import Forecaster, RangeSmoother
+from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference", 75.0)
+
+
+def test_a_quantity_knows_how_well_it_knows():
+    """Rides drawn from its own model: the errors of what it expects have the variance that it states."""
+    rng = np.random.default_rng(1)
+    normalised = []
+    for _ in range(150):
+        usual = rng.normal(1.0, 0.15)
+        quantity = Quantity(1.0, 0.15**2, 0.06**2, 0.2**2)
+        for _ in range(6):
+            level = usual + rng.normal(0, 0.06)
+            for _ in range(20):
+                quantity = quantity.learned(level + rng.normal(0, 0.2) - quantity.now, 250.0)
+            quantity = quantity.next_ride()
+        normalised.append((quantity.level - usual) / np.sqrt(quantity.level_variance))
+    assert 0.8 < np.std(normalised) < 1.25
+    assert abs(np.mean(normalised)) < 0.25
+
+
+def test_a_quantity_learns_how_unlike_rides_are():
+    rng = np.random.default_rng(2)
+    quantity = Quantity(1.0, 0.15**2, 0.05**2, 0.1**2)
+    for _ in range(60):
+        level = 0.9 + rng.normal(0, 0.12)
+        for _ in range(24):
+            quantity = quantity.learned(level + rng.normal(0, 0.1) - quantity.now, 250.0)
+        quantity = quantity.next_ride()
+    assert quantity.level == pytest.approx(0.9, abs=0.08)
+    assert np.sqrt(quantity.ride_variance) == pytest.approx(0.12, rel=0.35)
+
+
+def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
+    town, car = (Habits.before(PriorRiding(drift=drift), 0.02).price for drift in (0.055, 0.22))
+    assert car.scatter == pytest.approx(16 * town.scatter)
+
+
+def test_far_ahead_the_usual_counts_and_near_the_present():
+    quantity = Quantity(1.0, 0.001, 0.01, 0.01, deviation=0.2, deviation_variance=0.001)
+    near, far = quantity.ahead(1000.0), quantity.ahead(1e7)
+    assert near[0] == pytest.approx(1.2, abs=0.01)
+    assert far[0] == pytest.approx(1.0, abs=0.01)
+    assert far[1] == pytest.approx(0.001, rel=0.5)
+
+
+@pytest.mark.parametrize(("before", "most"), [(5, 16.0), (20, 16.0), (40, 16.0)])
+def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
+    """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(80):
+        quantity, smoother = Quantity(1.0, 0.17**2, 0.055**2, 0.2**2), RangeSmoother()
+        for k in range(4 * 70):
+            quantity = quantity.learned((1.0 if k < 4 * before else 1.2) + rng.normal(0, 0.17) - quantity.now, 250.0)
+            left = 100_000 - 250.0 * k  # as though it lasted for long
+            ridden = 250.0 if k else 0.0
+            found.append(
+                smoother.follow(left / quantity.ahead(left)[0], 90.0 * left, quantity.known_from, ridden) / left
+            )
+    price = 1 / np.mean(np.reshape(found, (80, -1)), axis=0)
+    late = price[4 * before :]
+    reached = np.argmax(late > 1 + 0.63 * 0.2) / 4
+    assert 0 < reached < most
+
+
+ANY = st.floats(-1e9, 1e9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(ANY, st.floats(1.0, 1e5), st.floats(0.0, 1e12)), min_size=1, max_size=60), st.integers(1, 40))
+def test_whatever_was_learned_can_be_restored(segments, repeats):
+    quantity = Quantity(1.0, 0.15**2, 0.055**2, 0.2**2)
+    for i, (residual, distance, noise) in enumerate(segments * repeats):
+        quantity = quantity.learned(residual, distance, noise)
+        if i % 7 == 6:
+            quantity = quantity.next_ride()
+    prior = Habits.before(PriorRiding(), 0.02)
+    learner = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
+    learner.state = replace(learner.state, habits=Habits(quantity, prior.stops, prior.pace, quantity))
+    again = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
+    again.restore(json.loads(json.dumps(learner.snapshot())))
+    assert again.habits == learner.habits
+    assert quantity.ahead(10_000.0)[1] >= 0
+    assert quantity.variance >= 0
+
+
+AIR = Conditions(20.0, 0.0)
+
+
+def steady(learner, metres, power, speed=10.0, grade=0.0):
+    """Riding at constant `power` [W]."""
+    for _ in range(round(metres / speed)):
+        learner.ride(1.0, speed, grade, power, AIR)
+
+
+def fresh():
+    return Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
+
+
+def test_recent_consumption_is_that_of_about_the_last_kilometre():
+    learner = fresh()
+    steady(learner, 390, 500.0)
+    assert learner.recent_consumption is None
+    steady(learner, 5000, 500.0)
+    assert learner.recent_consumption == pytest.approx(50.0)
+    steady(learner, 1000, 900.0)
+    assert learner.recent_consumption == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
+
+
+def test_bursts_are_expected_from_about_the_last_twelve_kilometres():
+    """To twice the mean power, then none."""
+    learner = fresh()
+    for _ in range(200):
+        steady(learner, 100, 1000.0)
+        steady(learner, 100, 0.0)
+    bursts = learner.expected(30e3, 20.0, 0.0).form_factor_squared
+    assert learner.state.sums.distance == pytest.approx(12_000, rel=0.05)
+    steady(learner, 24_000, 500.0)
+    even = learner.expected(30e3, 20.0, 0.0).form_factor_squared
+    assert 2.0 < bursts < 2.4
+    assert even < bursts - 0.5
+
+
+def test_before_much_is_ridden_bursts_are_those_of_the_prior_riding():
+    learner = fresh()
+    assert learner.expected(30e3, 20.0, 0.0).form_factor_squared == pytest.approx(2.5)
+    steady(learner, 3000, 800.0)
+    assert 1.5 < learner.expected(30e3, 20.0, 0.0).form_factor_squared < 2.0
+    assert not learner.mostly_prior or learner.state.sums.distance < 3000
+
+
+@pytest.mark.parametrize(("change", "taken"), [(10.0, True), (20.0, False)])
+def test_a_second_that_accelerates_as_no_road_allows_is_left_out(change, taken):
+    learner = fresh()
+    steady(learner, 100, 500.0)
+    before = learner._segment.distance
+    learner.ride(1.0, 10.0 + change, 0.0, 500.0, AIR)
+    assert (learner._segment.distance > before) == taken
+
+
+def test_a_segment_that_no_riding_explains_counts_for_little():
+    """A ferry queue that costs a hundred times the price moves it by a tenth."""
+    quantity = Quantity(1.0, 0.05**2, 0.055**2, 0.2**2)
+    assert 0.07 < quantity.learned(100.0, 250.0).now - 1 < 0.15
