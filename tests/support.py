@@ -13,11 +13,11 @@ from cantools.database.can import Database, Message
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.physics.effect import Port
 from gz_onboard.pipeline import TICK_NS, Pipeline
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]

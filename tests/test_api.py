@@ -18,8 +18,8 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import api, cli, state
-from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.writers import write_candump
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.writers import write_candump
 from tests.support import LOGS, ROOT
 from tests.test_learned import CAPACITY, saved
 

@@ -14,7 +14,7 @@ from threading import Thread
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.bus.logs import ESTIMATED, logs_among, read_frames
+from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
 from tests.bus.test_replay import Listener
 from tests.lab.short_logs import short_log
 from tests.support import LOGS, ROOT

@@ -25,6 +25,7 @@ LAYERS = [
     ["estimator"],
     ["log_rows"],
     ["pipeline"],
+    ["recording"],
     ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
@@ -42,9 +43,10 @@ FORBIDDEN = {
     ("daemon", "lab"): "the daemon carries no offline tools",
     ("daemon", "simulation"): "the daemon carries no offline tools",
     ("daemon", "offline"): "the daemon carries no offline tools",
+    ("daemon", "recording"): "the daemon carries no offline tools",
 }
 
-OFFLINE = ("offline", "simulation", "lab", "api")
+OFFLINE = ("recording", "offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
 # Imported only when asked for, or for types: the reference filter behind --filter filterpy, arrays.
 ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}

@@ -11,9 +11,7 @@ from __future__ import annotations
 import struct
 import sys
 from array import array
-from collections import Counter
 from collections.abc import Sequence
-from itertools import accumulate, chain
 from math import gcd
 from operator import sub
 
@@ -84,68 +82,6 @@ def encode_block(frames: Sequence[Frame]) -> bytes:
         joined = b"".join(of_kind)
         parts += [joined[i::length] for i in range(length)]
     return b"".join(parts)
-
-
-def decode_block(block: bytes) -> list[Frame]:
-    """The frames of one block, in the order in which they were given to `encode_block`.
-
-    Raises ValueError for anything that is not a whole block.
-    """
-    try:
-        version, width, kinds, count, first, unit = _HEAD.unpack_from(block)
-    except struct.error:
-        raise ValueError(f"a block of {len(block)} bytes is too short") from None
-    if version != _VERSION or width not in _WIDTHS or not kinds or not count:
-        raise ValueError(f"not a block of frames of version {_VERSION}")
-    order_type, order_width = ("B", 1) if kinds <= 256 else ("H", 2)
-    order_at = _HEAD.size + kinds * _KIND.size
-    steps_at = order_at + count * order_width
-    data_at = steps_at + (count - 1) * width
-    if len(block) < data_at:
-        raise ValueError(f"a block of {count} frames is cut off")
-    table = list(_KIND.iter_unpack(block[_HEAD.size : order_at]))
-    order = _little(array(order_type, block[order_at:steps_at]))
-    if max(order) >= kinds:
-        raise ValueError("a frame of a kind that the block does not have")
-    steps = _little(array(_WIDTHS[width], bytes(_rows(block, steps_at, count - 1, width))))
-    times = accumulate((step * unit for step in steps), initial=first)
-    datas = _datas(block, data_at, order, [length for _, _, length in table])
-    identifiers = [identifier for identifier, _, _ in table]
-    channels = [channel for _, channel, _ in table]
-    return list(zip(times, map(identifiers.__getitem__, order), datas, map(channels.__getitem__, order), strict=True))
-
-
-def _rows(block: bytes, at: int, count: int, width: int) -> bytearray:
-    """`count` rows of `width` bytes that stand at `at` as byte planes."""
-    rows = bytearray(count * width)
-    for i in range(width):
-        rows[i::width] = block[at + i * count : at + (i + 1) * count]
-    return rows
-
-
-def _datas(block: bytes, position: int, order: array[int], lengths: Sequence[int]) -> list[bytes]:
-    """The data of the frames in their order. `order`: the kind of each; `lengths`: of the data, by kind."""
-    of_kind: list[list[bytes]] = []
-    numbers = Counter(order)
-    for kind, length in enumerate(lengths):
-        number = numbers[kind]
-        end = position + number * length
-        if end > len(block):
-            raise ValueError(f"a block of {len(order)} frames is cut off")
-        if length:
-            of_kind.append(
-                [data for (data,) in struct.iter_unpack(f"{length}s", _rows(block, position, number, length))]
-            )
-        else:
-            of_kind.append([b""] * number)
-        position = end
-    if position != len(block):
-        raise ValueError(f"{len(block) - position} bytes too many after a block of {len(order)} frames")
-    # Stable sorting of the frames' places by kind gives, for each frame in order of kind, where it belongs.
-    datas = [b""] * len(order)
-    for place, data in zip(sorted(range(len(order)), key=order.__getitem__), chain.from_iterable(of_kind), strict=True):
-        datas[place] = data
-    return datas
 
 
 def _little(values: array[int]) -> array[int]:

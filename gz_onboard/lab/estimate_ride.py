@@ -10,7 +10,6 @@ from itertools import chain
 from pathlib import Path
 
 from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS, Codec
-from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError
@@ -24,6 +23,7 @@ from gz_onboard.offline.samples import check_ridden, of_ride, open_ride
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
+from gz_onboard.recording.logs import LogDamage
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 

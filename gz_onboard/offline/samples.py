@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
-from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError, brief, nearest, shown
@@ -20,6 +19,7 @@ from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, Event, Frame, hexade
 from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.options import MOST_PAYLOAD
+from gz_onboard.recording.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -22,10 +22,11 @@ from struct import Struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources
-from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES, Frame
+from gz_onboard.recording.frames import BATCH, TIME_LIMIT_NS
+from gz_onboard.recording.readers.contents import Damage, unpacked
 from gz_onboard.routes.columns import separated
 
 if TYPE_CHECKING:

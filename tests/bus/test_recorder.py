@@ -16,12 +16,14 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.background import Background
-from gz_onboard.bus import framelog, logfile, logs, recorder
+from gz_onboard.bus import framelog, logfile, recorder
 from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.recorder import Limits, Recorder, is_complete
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
+from gz_onboard.recording import logs
+from gz_onboard.recording.readers.mcap import decode_block
 
 START = 1_750_000_000_000_000_000  # 2025-06-15T15:06:40Z
 SECOND = 1_000_000_000
@@ -90,7 +92,7 @@ def test_another_mcap_reader_finds_topics_schemas_and_json(tmp_path: Path) -> No
         assert (channel.message_encoding, channel.metadata) == ("json", {"rate": "1 Hz"})
         assert message.log_time == batches[50][0][0]
         blocks = [message.data for _, _, message in reader.iter_messages(framelog.TOPIC)]
-        assert [frame for block in blocks for frame in framelog.decode_block(block)] == flat(batches)
+        assert [frame for block in blocks for frame in decode_block(block).tuples()] == flat(batches)
         assert [attachment.name for attachment in reader.iter_attachments()] == ["a.dbc"]
         late = list(reader.iter_messages("/estimate", starting_at=batches[60][0][0]))
         assert len(late) == 1
@@ -108,7 +110,7 @@ def test_no_block_holds_more_than_its_frames_or_a_second(tmp_path: Path) -> None
     file.close()
     with (tmp_path / "a.mcap").open("rb") as read_stream:
         for _, _, message in make_reader(read_stream).iter_messages(log_time_order=False):
-            sizes.append(framelog.decode_block(message.data))
+            sizes.append(decode_block(message.data).tuples())
             assert message.log_time == sizes[-1][0][0]
     assert flat(sizes) == sparse + dense + back + sparse
     assert max(map(len, sizes)) <= logfile.BLOCK_FRAMES

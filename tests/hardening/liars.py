@@ -15,9 +15,9 @@ from functools import cache
 from itertools import chain
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Estimate, Event, State
+from gz_onboard.recording.logs import read_frames
 from tests.hardening.report import Report
 from tests.support import LOGS, reference
 

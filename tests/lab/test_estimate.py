@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_log import EstimateTask
@@ -29,6 +28,7 @@ from gz_onboard.lab.estimate_route import RouteSummary, off_text
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, gains
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import HEARS_CTRL_C
 

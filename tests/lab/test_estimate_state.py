@@ -19,9 +19,7 @@ import pytest
 import gz_onboard as gz
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.recorder import is_complete
-from gz_onboard.bus.writers import write_blf
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
 from gz_onboard.daemon.loop import Daemon
@@ -29,6 +27,8 @@ from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_order import span_of
 from gz_onboard.lab.estimate_ride import open_estimate
 from gz_onboard.pipeline import TICK_NS
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.writers import write_blf
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.lab.short_logs import short_log
 from tests.support import S, identifier, recorded, reference, with_cell_voltages

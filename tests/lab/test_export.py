@@ -16,12 +16,12 @@ from mcap.reader import make_reader
 from gz_onboard import cli
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.signals import Decoder, column_name
-from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export as command
+from gz_onboard.recording.logs import read_frames, read_samples
+from gz_onboard.recording.writers import write_candump
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
 
@@ -414,7 +414,7 @@ def test_nothing_half_written_has_the_name(
         yield from list(read_frames(*given, **more))[:2]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gz_onboard.bus.logs.read_frames", interrupted)
+    monkeypatch.setattr("gz_onboard.recording.logs.read_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(log, tmp_path / name)
     assert (tmp_path / name).read_text() == "before"

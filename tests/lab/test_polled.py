@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.writers import write_candump
 from gz_onboard.cli import main
+from gz_onboard.recording.writers import write_candump
 from tests.polled import CHARGE, KONA, polled_ride
 
 SECONDS = 30

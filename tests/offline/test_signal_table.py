@@ -15,10 +15,10 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.logs import read_samples as logged_samples
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples, open_ride, read_samples
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.logs import read_samples as logged_samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 REFERENCE = read_vehicle("reference")
@@ -245,7 +245,7 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     lines = ["time [s]," + ",".join(f"{role} [{UNITS[role]}]" for role in roles)]
     lines += [f"{start * 1e-9 + t:.6f}," + ",".join(str(row.get(r, "")) for r in roles) for t, row in rows.items()]
     (tmp_path / "table.csv").write_text("\n".join(lines))
-    from gz_onboard.bus.writers import write_candump
+    from gz_onboard.recording.writers import write_candump
 
     with (tmp_path / "frames.log").open("w") as stream:
         write_candump(stream, [head])

@@ -15,11 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.log_rows import estimate_row
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"

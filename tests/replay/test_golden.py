@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
 from gz_onboard.log_rows import estimate_row
+from gz_onboard.recording.logs import read_frames
 from tests.replay import golden, regenerate
 
 LOGS = golden.logs()

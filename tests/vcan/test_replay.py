@@ -6,8 +6,8 @@ from pathlib import Path
 
 import can
 
-from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.events import EFF_FLAG, RTR_FLAG, Frame
+from gz_onboard.recording.readers.python_can import frame_of
 from tests.bus.test_replay import START, frames, log, payload, run
 
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import IO
 
-from gz_onboard.bus.readers import blf
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 
 
@@ -39,6 +38,9 @@ def write_candump(stream: IO[str], batches: Iterable[Iterable[Frame]]) -> int:
     return count
 
 
+_BLF_CAN = struct.Struct("<HBBL8s")  # channel, flags, length, identifier, data
+_BLF_FD = struct.Struct("<HBBLLBBB5x64s")
+_BLF_ERROR = struct.Struct("<HHLBBBxLLH2x8s")
 _BLF_FILE = struct.Struct("<4sL8B2Q2L8H8H72x")
 _BLF_OBJECT = struct.Struct("<4sHHLLLHHQ")  # signature, header, version, size, type, time unit, client, version, time
 _BLF_CONTAINER = struct.Struct("<4sHHLLH6xL4x")
@@ -85,12 +87,12 @@ def _blf_object(frame: Frame, start_ns: int) -> bytes:
     flags = (0x80 if identifier & RTR_FLAG else 0) | (0x01 if channel & TRANSMITTED else 0)
     bare = identifier & (EFF_FLAG | 0x1FFF_FFFF)
     if identifier & ERR_FLAG:
-        kind, body = 73, blf.ERROR.pack(number, 0, 0, 0, 0, min(len(data), 8), 0, bare, 0, data[:8])
+        kind, body = 73, _BLF_ERROR.pack(number, 0, 0, 0, 0, min(len(data), 8), 0, bare, 0, data[:8])
     elif len(data) > 8:
         code = _BLF_FD_CODES.get(len(data), 15)
-        kind, body = 100, blf.FD.pack(number, flags, code, bare, 0, 0, 1, len(data), data)
+        kind, body = 100, _BLF_FD.pack(number, flags, code, bare, 0, 0, 1, len(data), data)
     else:
-        kind, body = 1, blf.CAN.pack(number, flags, len(data), bare, data)
+        kind, body = 1, _BLF_CAN.pack(number, flags, len(data), bare, data)
     size = _BLF_OBJECT.size + len(body)
     return (
         _BLF_OBJECT.pack(b"LOBJ", _BLF_OBJECT.size, 1, size, kind, _BLF_NANOSECONDS, 0, 0, max(time_ns - start_ns, 0))

@@ -18,11 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.logs import LogDamage, log_suffix, logs_among, read_frames
 from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.logs import LogDamage, log_suffix, logs_among, read_log
 
 if TYPE_CHECKING:
     import can
@@ -129,7 +130,7 @@ def socket_sender(raw: socket.socket) -> Send:
 
 def bus_sender(bus: can.BusABC) -> Send:
     """Sends through any of python-can's interfaces."""
-    from gz_onboard.bus.readers.pycan import message_of
+    from gz_onboard.recording.readers.python_can import message_of
 
     return _patient(lambda frame: bus.send(message_of(frame, with_time=False)))
 
@@ -178,27 +179,27 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--speed {arguments.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more"
         )
-    parts = _parts(arguments)
+    damages: list[LogDamage] = []
+    parts = _parts(arguments, damages)
     names = [name for name in arguments.channel.split(",") if name]
     buses = _open_buses(arguments.interface, names)
     summary = Sent()
-    damages: list[LogDamage] = []
     status = OK
     try:
         senders = [_sender(bus) for bus in buses]
         send = senders[0] if len(senders) == 1 else _by_channel(senders)
         with progress_bar(lambda: None, quiet=arguments.quiet) as display:
 
-            def show(part: _Part, seconds: float) -> None:
-                what = "the log" if len(parts) == 1 else part.log.name
+            def show(log: Path, seconds: float) -> None:
+                what = "the log" if len(parts) == 1 else log.name
                 display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
 
             while True:
                 summary.loops += 1
-                for part in parts:
-                    batches = read_frames(part.log, part.start_ns, part.end_ns, damages.append)
-                    kept = _sendable(batches, part.received_only, len(senders), summary)
-                    replay(kept, send, arguments.speed, summary, partial(show, part))
+                for log, frames in parts:
+                    kept = _sendable(frames, len(senders))
+                    summary.skipped += len(frames) - len(kept)
+                    replay(kept.batches(), send, arguments.speed, summary, partial(show, log))
                 if not summary.sent and not summary.failed:
                     raise InputError(f"{arguments.log}: no frames to send in the chosen part")
                 if not arguments.loop:
@@ -215,56 +216,37 @@ def run(arguments: argparse.Namespace) -> int:
     return status
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What is sent of a log: between two times [ns], where they are given."""
-
-    log: Path
-    start_ns: int | None
-    end_ns: int | None
-    received_only: bool
-
-
-def _parts(arguments: argparse.Namespace) -> list[_Part]:
+def _parts(arguments: argparse.Namespace, damages: list[LogDamage]) -> list[tuple[Path, FrameColumns]]:
     """What is sent, of each log; InputError for one that is missing, which comes before what is wrong with the bus."""
     logs = logs_among([arguments.log])
     if len(logs) > 1 and (arguments.start or arguments.end is not None):
         raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
     parts = []
     for log in logs:
-        section = log_section(log, arguments.start, arguments.end)
-        parts.append(_Part(log, *section, received_only=log_suffix(log) == ".mcap" and not arguments.all))
-        read_frames(log)
+        frames = read_log(log, on_damage=damages.append)
+        frames = frames.between(*log_section(log, frames, arguments.start, arguments.end))
+        if log_suffix(log) == ".mcap" and not arguments.all:
+            frames = frames[frames.channel & TRANSMITTED == 0]
+        parts.append((log, frames))
     return parts
 
 
-def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
-    """--from and --to [s from the first frame] as times [ns] for `read_frames`; InputError if they are none."""
+def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
+    """--from and --to [s from the first frame] as times [ns]; InputError if they are none, or there is no frame."""
     if end_s is not None and not end_s > start_s:
         raise InputError(f"--to {end_s:g} s: must be after --from {start_s:g} s")
     if not start_s and end_s is None:
         return None, None
-    first = next(read_frames(path, on_damage=lambda _: None), None)
-    if first is None:
-        raise InputError(f"{path}: no frames in this log")
-    first_ns = first[0][0]
+    if not len(frames):
+        raise InputError(f"{log}: no frames in this log")
+    first_ns = int(frames.time_ns[0])
     return first_ns + round(start_s * 1e9), None if end_s is None else first_ns + round(end_s * 1e9)
 
 
-def _sendable(
-    batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Sent
-) -> Iterable[list[Frame]]:
+def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
     """Without error frames, which no host can send, and what is not for the channels at hand."""
-    for batch in batches:
-        kept = [
-            frame
-            for frame in batch
-            if not frame[1] & ERR_FLAG
-            and not (received_only and frame[3] & TRANSMITTED)
-            and (channels == 1 or frame[3] & ~TRANSMITTED < channels)
-        ]
-        summary.skipped += len(batch) - len(kept)
-        yield kept
+    sendable = frames.identifier & ERR_FLAG == 0
+    return frames[sendable if channels == 1 else sendable & (frames.channel & ~TRANSMITTED < channels)]
 
 
 def _by_channel(senders: list[Send]) -> Send:

@@ -9,12 +9,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus import logs, tables
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.signals import Decoder
-from gz_onboard.bus.writers import write_blf, write_candump
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
+from gz_onboard.recording import logs, tables
+from gz_onboard.recording.writers import write_blf, write_candump
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -72,7 +72,7 @@ def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> i
         with out.open("wb") as binary:
             return write_blf(binary, batches)
     from gz_onboard.bus._can import can
-    from gz_onboard.bus.readers.pycan import message_of, with_asammdf
+    from gz_onboard.recording.readers.python_can import message_of, with_asammdf
 
     if suffix == ".mf4":
         with_asammdf(out)

@@ -1,9 +1,8 @@
-"""Reading recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
+"""Read recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
 
-BLF, candump and our own files have a reader of their own, five to ten times as fast as one that builds a message
-object for each frame; python-can reads the rest of what it knows. The content tells the format; the name only where
-the content does not. A damaged log is read as far as it can be: what is lost is counted and reported once
-(`LogDamage`), never silently and never by giving up. Times that are not since 1970 are said in a warning.
+The content tells the format; the name only where the content does not. A damaged log is read as far as possible: what
+is lost is counted and reported once (`LogDamage`), never silently and never by giving up. Times that are not since 1970
+are said in a warning.
 
 A frame has the kernel's identifier flags. The data of a remote frame are as many zero bytes as it asked for. A
 CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
@@ -23,33 +22,46 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
-from gz_onboard.bus.readers.common import FD_LENGTHS, TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
+from mcap.writer import MCAP0_MAGIC
+
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, Frame
+from gz_onboard.events import MOST_EXTENDED, Frame
+from gz_onboard.recording.frames import FD_LENGTHS, FrameColumns
+from gz_onboard.recording.readers import blf, candump, lines, mcap
+from gz_onboard.recording.readers.contents import ASC_BASE, Contents, Damage, Reader, unpacked
 
 _LOG = logging.getLogger(__name__)
 
 _SAVVYCAN, _TABLE = "SavvyCAN's CSV", "a table"
 
 
-def _refuse_table(path: Path, _data: Contents, _damage: Damage, _start: int | None, _end: int | None) -> Any:
+def _refuse_table(path: Path, _data: Contents, _damage: Damage) -> FrameColumns:
     raise InputError(
         f"{path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
     )
+
+
+def _python_can(suffix: str) -> Reader:
+    """The reader of a format that python-can reads, which is imported when it is needed."""
+
+    def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
+        from gz_onboard.recording.readers import python_can
+
+        return python_can.read(path, suffix, data, damage)
+
+    return read
 
 
 _READERS: dict[str, Reader] = {
     ".mcap": mcap.read,
     ".blf": blf.read,
     ".log": candump.read,
-    **{suffix: pycan.text_reader(suffix) for suffix in (".asc", ".csv", ".trc")},
-    ".mf4": pycan.read_mf4,
+    **{suffix: _python_can(suffix) for suffix in (".asc", ".csv", ".trc", ".mf4")},
     ".crtd": lines.read_crtd,
     _SAVVYCAN: lines.read_savvycan,
     _TABLE: _refuse_table,
 }
-_MAGIC = {b"LOGG": ".blf", mcap.MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
+_MAGIC = {b"LOGG": ".blf", MCAP0_MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
 _FOREIGN_FORMATS = {
     rb"\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x4d\x3c\xb2\xa1|\xa1\xb2\x3c\x4d|\n\r\r\n": (
         "Wireshark's captures are not read; record with candump -L"
@@ -65,12 +77,11 @@ _FIRST_LINES = {
     _SAVVYCAN: lines.SAVVYCAN_HEADER,
     ".csv": re.compile(r"timestamp,arbitration_id,"),
     ".asc": re.compile(
-        rf"{pycan.ASC_BASE.pattern}|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
-        re.I,
+        rf"{ASC_BASE.pattern}|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b", re.I
     ),
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
     ".crtd": lines.CRTD_LINE,
-    ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
+    ".log": re.compile(rf"(?:{candump.LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
 _TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
@@ -93,23 +104,41 @@ class LogDamage:
         return f"{self.path}: {self.place}: {self.reason}{more}: skipped"
 
 
+def read_log(
+    path: str | Path,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    on_damage: Callable[[LogDamage], None] | None = None,
+) -> FrameColumns:
+    """Read the frames of a log, in the order in which they stand in it.
+
+    start_ns, end_ns: only frames with start_ns <= time < end_ns [ns since the epoch, as in the log]. on_damage is
+    called once if something could not be read; without it a warning is logged. Raises InputError for a file that is
+    missing or not of the format that its content or name says.
+    """
+    path = Path(path)
+    suffix, damage = log_suffix(path), Damage()
+    frames = _READERS[suffix](path, unpacked(path, _load(path), damage), damage)
+    impossible = frames.impossible()
+    if impossible.any():
+        for frame in frames[impossible].tuples():
+            damage.add("a frame", _problem(frame))
+        frames = frames[~impossible]
+    for note in damage.notes:
+        _LOG.warning("%s: %s", path, note)
+    if damage.count:
+        (on_damage or _warn)(LogDamage(path, damage.count, damage.place, damage.reason))
+    return frames.between(start_ns, end_ns)
+
+
 def read_frames(
     path: str | Path,
     start_ns: int | None = None,
     end_ns: int | None = None,
     on_damage: Callable[[LogDamage], None] | None = None,
 ) -> Iterator[list[Frame]]:
-    """The frames of a log in the order in which they stand in it, in lists of up to about a thousand.
-
-    start_ns, end_ns: only frames with start_ns <= time < end_ns [ns since the epoch, as in the log].
-    on_damage is called once, after the last frame, if something could not be read; without it a warning is logged.
-    Raises InputError for a file that is missing or not of the format that its suffix says; a missing file or
-    unknown suffix at once, the rest when the first frames are asked for.
-    """
-    path = Path(path)
-    suffix = log_suffix(path)
-    data = _load(path)
-    return _filtered(path, _READERS[suffix], data, start_ns, end_ns, on_damage or _warn)
+    """Read the frames of a log as tuples, in lists of up to a thousand; arguments and errors as of `read_log`."""
+    return read_log(path, start_ns, end_ns, on_damage).batches()
 
 
 def log_suffix(path: Path) -> str:
@@ -264,13 +293,12 @@ def read_samples(
     damage = Damage()
     if not (own := _own(path, damage)):
         return
-    for topic, time_ns, text in mcap.samples(*own, damage, start_ns, end_ns):
-        try:
-            values = json.loads(text)
-        except (ValueError, RecursionError):
+    for topic, time_ns, text in mcap.samples(*own, damage):
+        if time_ns < (start_ns or 0) or (end_ns is not None and time_ns >= end_ns):
             continue
-        if isinstance(values, dict):
-            yield topic, time_ns, values
+        with suppress(ValueError, RecursionError):
+            if isinstance(values := json.loads(text), dict):
+                yield topic, time_ns, values
     if damage.count and on_damage:
         on_damage(LogDamage(Path(path), damage.count, damage.place, damage.reason))
 
@@ -296,55 +324,11 @@ def _load(path: Path) -> Contents:
         raise unreadable(path, error) from None
 
 
-def _filtered(
-    path: Path,
-    reader: Reader,
-    data: Contents,
-    start_ns: int | None,
-    end_ns: int | None,
-    on_damage: Callable[[LogDamage], None],
-) -> Iterator[list[Frame]]:
-    damage = Damage()
-    earliest = start_ns if start_ns is not None else 0
-    latest = end_ns if end_ns is not None else TIME_LIMIT_NS
-    for batch in reader(path, unpacked(path, data, damage), damage, start_ns, end_ns):
-        frames = batch
-        if batch and not _plausible(batch):
-            frames = []
-            for frame in batch:
-                if problem := _problem(frame):
-                    damage.add("a frame", problem)
-                else:
-                    frames.append(frame)
-        if start_ns is not None or end_ns is not None:
-            frames = [frame for frame in frames if earliest <= frame[0] < latest]
-        if frames:
-            yield frames
-    for note in damage.notes:
-        _LOG.warning("%s: %s", path, note)
-    if damage.count:
-        on_damage(LogDamage(path, damage.count, damage.place, damage.reason))
-
-
-def _plausible(batch: list[Frame]) -> bool:
-    """Whether `_problem` finds none in the frames, many times as fast."""
-    times, identifiers, data, _ = zip(*batch, strict=True)
-    standard = (identifier for identifier in set(identifiers) if not identifier & (EFF_FLAG | ERR_FLAG))
-    return (
-        min(times) >= 0
-        and max(times) < TIME_LIMIT_NS
-        and set(map(len, data)) <= FD_LENGTHS
-        and all(identifier & MOST_EXTENDED <= MOST_STANDARD for identifier in standard)
-    )
-
-
 def _problem(frame: Frame) -> str:
-    """What is wrong with a frame that no bus carries; empty if nothing is."""
+    """Why no bus carries a frame."""
     time_ns, identifier, data, _ = frame
-    if not 0 <= time_ns < TIME_LIMIT_NS:
+    if time_ns < 0:
         return f"{time_ns} ns is no time"
     if len(data) not in FD_LENGTHS:
         return f"no frame has {len(data)} bytes"
-    if not identifier & (EFF_FLAG | ERR_FLAG) and identifier & MOST_EXTENDED > MOST_STANDARD:
-        return f"identifier {identifier & MOST_EXTENDED:X} has more than 11 bits"
-    return ""
+    return f"identifier {identifier & MOST_EXTENDED:X} has more than 11 bits"
