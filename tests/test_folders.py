@@ -15,8 +15,8 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
-from tests.bus.test_replay import Listener
 from tests.lab.short_logs import short_log
+from tests.recording.test_replay import Listener
 from tests.support import LOGS, ROOT
 
 RIDE = str(LOGS / "coastdown.blf")

@@ -75,7 +75,7 @@ def decode_columns(frames: FrameColumns, codec: Codec) -> dict[str, Column]:
 
 def _by_place(frames: FrameColumns) -> list[tuple[int, int, NDArray[np.int64]]]:
     """(channel, identifier, rows in their order) of all places, in the order in which they are first heard."""
-    places = (frames.channel & ~np.uint8(TRANSMITTED)).astype(np.int64) << 32 | frames.identifier
+    places = frames.bus.astype(np.int64) << 32 | frames.identifier
     known = np.unique(places)
     number = np.searchsorted(known, places).astype(np.uint16 if len(known) < 1 << 16 else np.int64)
     order = np.argsort(number, kind="stable")  # of 16 bits: a radix sort

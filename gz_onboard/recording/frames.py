@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, Frame
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, TRANSMITTED, Frame
 
 BATCH = 1000
 """Frames that `FrameColumns.batches` hands out at once."""
@@ -83,6 +83,11 @@ class FrameColumns:
     def __getitem__(self, rows: Any) -> FrameColumns:
         """The frames that a slice, a mask or an array of indices selects."""
         return replace(self, **{name: getattr(self, name)[rows] for name in (*_SCALARS, "data")})
+
+    @property
+    def bus(self) -> NDArray[np.uint8]:
+        """The channel without the flag of frames that we sent."""
+        return self.channel & ~np.uint8(TRANSMITTED)
 
     def between(self, start_ns: int | None, end_ns: int | None) -> FrameColumns:
         """The frames with start_ns <= time < end_ns; None: no limit."""

@@ -246,7 +246,7 @@ def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | 
 def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
     """Without error frames, which no host can send, and what is not for the channels at hand."""
     sendable = frames.identifier & ERR_FLAG == 0
-    return frames[sendable if channels == 1 else sendable & (frames.channel & ~TRANSMITTED < channels)]
+    return frames[sendable if channels == 1 else sendable & (frames.bus < channels)]
 
 
 def _by_channel(senders: list[Send]) -> Send:

@@ -38,7 +38,7 @@ def by_message(decoded: Iterable[Decoded]) -> dict[str, MessageRows]:
 
 def write_long(out: Path, messages: Mapping[str, MessageRows]) -> None:
     """Write one table of all signals, message by message: a row for each value, in .jsonl one for each frame."""
-    if out.suffix.lower() == ".jsonl":
+    if _suffix(out) == ".jsonl":
         with open_text(out) as stream:
             for message, rows in messages.items():
                 for time_ns, *values in zip(rows.times, *rows.columns.values(), strict=True):
@@ -65,7 +65,7 @@ data: hexadecimal.
 def frame_columns(frames: FrameColumns) -> dict[str, list[Any]]:
     """The columns of `FRAME`."""
     columns = (
-        frames.channel & ~TRANSMITTED & 0xFF,
+        frames.bus,
         frames.identifier & MOST_EXTENDED,
         *(frames.identifier & flag != 0 for flag in (EFF_FLAG, RTR_FLAG, ERR_FLAG)),
         frames.channel & TRANSMITTED != 0,
@@ -82,26 +82,32 @@ def write_table(
 ) -> None:
     """Write a table to a .csv, .parquet or .jsonl file, its first column the `times` [ns], if there are any.
 
-    Numbers have the 15 digits that a float has for sure: 28 times 0.1 is 2.8, not 2.8000000000000003. kinds: str, int,
-    bool or float of a column in Parquet; of others str if it has a text, else float.
+    With times, numbers have the 15 digits that a float has for sure: 28 times 0.1 is 2.8, not 2.8000000000000003.
+    kinds: str, int, bool or float of a column in Parquet; of others str if it has a text, else float.
     """
-    suffix = out.with_suffix("").suffix if out.suffix.lower() == ".gz" else out.suffix
-    if suffix.lower() == ".parquet":
+    if _suffix(out) == ".parquet":
         import pyarrow.parquet as pq
 
         pq.write_table(_arrow_table(times, columns, kinds or {}), out)
         return
     rows = zip(*columns.values(), strict=True)
     with open_text(out) as stream:
-        if suffix.lower() == ".jsonl":
+        if _suffix(out) == ".jsonl":
             named = (dict(zip(columns, row, strict=True)) for row in rows)
             stamps = repeat(None) if times is None else times
             stream.writelines(map(_json_line, stamps, named))
             return
         writer = csv.writer(stream)
         writer.writerow(columns if times is None else ["time[s]", *columns])
-        texts = (list(map(_decimal, row)) for row in rows)
-        writer.writerows(texts if times is None else ([_seconds(t), *row] for t, row in zip(times, texts, strict=True)))
+        if times is None:
+            writer.writerows(rows)
+        else:
+            writer.writerows([_seconds(t), *map(_decimal, row)] for t, row in zip(times, rows, strict=True))
+
+
+def _suffix(out: Path) -> str:
+    """The suffix that says the format, without the .gz of a packed file."""
+    return (out.with_suffix("") if out.suffix.lower() == ".gz" else out).suffix.lower()
 
 
 def open_text(out: Path) -> IO[str]:
@@ -135,9 +141,9 @@ def _number(value: object) -> float | None:
 
 def _json_line(time_ns: int | None, row: Mapping[str, object]) -> str:
     """A line of JSON, the time in seconds to the nanosecond, which no float has."""
-    text = json.dumps({name: _decimal(value) for name, value in row.items()}, ensure_ascii=False)
     if time_ns is None:
-        return f"{text}\n"
+        return json.dumps(row, ensure_ascii=False) + "\n"
+    text = json.dumps({name: _decimal(value) for name, value in row.items()}, ensure_ascii=False)
     return f'{{"time[s]": {_seconds(time_ns)}{", " if row else ""}{text[1:]}\n'
 
 

@@ -9,6 +9,7 @@ from gz_onboard.bus.codec import AHEAD_NS, BACK_NS, CONFIRM, Codec
 
 _GAP_NS = 500_000_000  # ahead by less is no gap
 _DENSE = 20  # frames without a gap: a bus that sends as many does not end in a gap and one frame or two
+_INT64 = np.iinfo(np.int64)
 _LEAST_WINDOW, _MOST_WINDOW = 16, 1 << 16  # frames that are looked at together
 
 
@@ -87,8 +88,9 @@ def _follow(time_ns: NDArray[np.int64], place: int, last: int, ahead_ns: int) ->
     while place < len(time_ns):
         times = time_ns[place : place + window]
         latest = np.maximum.accumulate(np.concatenate(([last], times)))
-        steps = times - latest[:-1]
-        apart = np.flatnonzero((steps < -BACK_NS) | (steps > ahead_ns))
+        earliest = np.maximum(latest[:-1], _INT64.min + BACK_NS) - BACK_NS
+        farthest = np.minimum(latest[:-1], _INT64.max - ahead_ns) + ahead_ns
+        apart = np.flatnonzero((times < earliest) | (times > farthest))
         if len(apart):
             return place + int(apart[0]), int(latest[apart[0]]), place + int(apart[0]) - begin
         place, last, window = place + len(times), int(latest[-1]), min(2 * window, _MOST_WINDOW)

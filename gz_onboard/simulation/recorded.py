@@ -21,11 +21,12 @@ from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import INSTRUMENTS, Event
-from gz_onboard.offline.samples import extended, open_ride, read_roles, ride_name
+from gz_onboard.offline.samples import extended, open_ride, read_samples, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import first_soc, standing_load
 from gz_onboard.physics.sensors import speed_role, true_columns
+from gz_onboard.recording.timeline import stray
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -133,7 +134,13 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
             if reads_vibration:
                 rough.append((event[0], road.distance, estimator.vibration(event[0])))
 
-    columns = true_columns(read_roles(log, vehicle, (codec, frames), progress, observe), vehicle.parameters)
+    columns = true_columns(read_samples(log, vehicle).columns, vehicle.parameters)
+    kept = frames[~stray(frames.time_ns)]
+    for batch in kept.batches():
+        for event in codec.decode(batch):
+            observe(event)
+        if progress:
+            progress(len(batch))
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]

@@ -303,7 +303,7 @@ def test_a_signal_shows_which_vehicle_it_is(short, tmp_path):
             write_blf(stream, [sorted([*frames, *own])])
         ride = open_estimate(log, read_vehicle(file))
         assert ride.vehicle.name == f"reference-scooter{shown}"
-        assert sum(map(len, ride.batches)) == len(frames) + len(own)
+        assert len(ride.frames) == len(frames) + len(own)
 
 
 def test_what_does_not_go_together(short, tmp_path, capsys):
