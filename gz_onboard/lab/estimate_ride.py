@@ -67,12 +67,10 @@ def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = N
             if _GAP_NS < first - now <= _PAUSE_NS:
                 for step in range(now + _GAP_NS, first, _GAP_NS):
                     pipeline.advance((), step)
-            if (
-                first - now > _PAUSE_NS
-            ):  # the ride goes on where the new time is believed, not at the end of the portion
-                pipeline.advance(portion[:CONFIRM], portion[:CONFIRM][-1][0])
-                portion = portion[CONFIRM:]
-            pipeline.advance(portion, last)
+            begun = CONFIRM if first - now > _PAUSE_NS else 0
+            if begun:  # the ride goes on where the new time is believed, not at the end of the portion
+                pipeline.advance(portion[:begun], portion[:begun][-1][0])
+            pipeline.advance(portion[begun:], last)
             now = last
         if progress:
             progress(len(batch))

@@ -15,6 +15,7 @@ import logging
 import mmap
 import re
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,9 +27,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
 from gz_onboard.events import MOST_EXTENDED, Frame
-from gz_onboard.recording.frames import FD_LENGTHS, FrameColumns
+from gz_onboard.recording.frames import FD_LENGTHS, TIME_LIMIT_NS, FrameColumns
 from gz_onboard.recording.readers import blf, candump, lines, mcap
-from gz_onboard.recording.readers.contents import ASC_BASE, Contents, Damage, Reader, unpacked
+from gz_onboard.recording.readers.contents import Contents, Damage, Reader, unpacked
 
 _LOG = logging.getLogger(__name__)
 
@@ -77,7 +78,8 @@ _FIRST_LINES = {
     _SAVVYCAN: lines.SAVVYCAN_HEADER,
     ".csv": re.compile(r"timestamp,arbitration_id,"),
     ".asc": re.compile(
-        rf"{ASC_BASE.pattern}|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b", re.I
+        r"\s*base\s+(?:hex|dec)|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
+        re.I,
     ),
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
     ".crtd": lines.CRTD_LINE,
@@ -264,20 +266,24 @@ def _is_log(file: Path, estimates: bool | None) -> bool:
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
     """The files attached to one of our own logs by name, such as the DBC files; of other formats none."""
-    own = _own(path)
-    return mcap.attachments(*own) if own else {}
+    own = _own(path, Damage())
+    return own.attachments if own else {}
 
 
 def read_metadata(path: str | Path, record: str = "gz_onboard") -> dict[str, str]:
     """The metadata of one of our own logs (vehicle, version, ...), or another record of it; of other formats none."""
-    own = _own(path)
-    return mcap.metadata(*own, record) if own else {}
+    own = _own(path, Damage())
+    return own.metadata.get(record, {}) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
     """Schema (a JSON text) and metadata of each topic of samples in one of our own logs; of other formats none."""
-    own = _own(path)
-    return mcap.json_channels(*own) if own else {}
+    if not (own := _own(path, Damage())):
+        return {}
+    if not own.channels:  # only the chunks of a log that was cut off declare them
+        deque(own.messages(), maxlen=0)
+    found = (channel for channel in own.channels.values() if channel.message_encoding == "json")
+    return {channel.topic: (own.schemas.get(channel.schema_id, b"{}"), channel.metadata) for channel in found}
 
 
 def read_samples(
@@ -288,26 +294,30 @@ def read_samples(
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
 
-    on_damage: as of `read_frames`; without it damage is passed over, for one who reads the frames too.
+    start_ns, end_ns, on_damage: as of `read_log`; without on_damage damage is passed over, for one who reads the frames
+    too.
     """
-    damage = Damage()
-    if not (own := _own(path, damage)):
-        return
-    for topic, time_ns, text in mcap.samples(*own, damage):
-        if time_ns < (start_ns or 0) or (end_ns is not None and time_ns >= end_ns):
+    path, damage = Path(path), Damage()
+    own = _own(path, damage)
+    for message in own.messages() if own else ():
+        topic, time_ns = message.channel.topic, message.published_ns
+        if message.channel.message_encoding != "json":
             continue
-        with suppress(ValueError, RecursionError):
-            if isinstance(values := json.loads(text), dict):
-                yield topic, time_ns, values
+        if (latest := max(message.logged_ns, time_ns)) >= TIME_LIMIT_NS:
+            damage.add(f"a sample of {topic}", f"{latest} ns is no time")
+        elif (start_ns or 0) <= time_ns < (TIME_LIMIT_NS if end_ns is None else end_ns):
+            with suppress(ValueError, RecursionError):
+                if isinstance(values := json.loads(message.data), dict):
+                    yield topic, time_ns, values
     if damage.count and on_damage:
-        on_damage(LogDamage(Path(path), damage.count, damage.place, damage.reason))
+        on_damage(LogDamage(path, damage.count, damage.place, damage.reason))
 
 
-def _own(path: str | Path, damage: Damage | None = None) -> tuple[Path, Contents] | None:
-    """(path, contents) of a log in our own format; None for other formats. InputError for one that is not there."""
+def _own(path: str | Path, damage: Damage) -> mcap.LogContents | None:
+    """A log in our own format; None of another. InputError for one that is not there."""
     path = Path(path)
     form, data = log_suffix(path), _load(path)
-    return (path, unpacked(path, data, damage or Damage())) if form == ".mcap" else None
+    return mcap.LogContents(path, unpacked(path, data, damage), damage) if form == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:

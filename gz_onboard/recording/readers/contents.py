@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import mmap
 import re
 import zlib
 from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,12 +20,12 @@ from gz_onboard.events import TRANSMITTED, Frame
 from gz_onboard.recording.frames import BATCH, FrameColumns
 
 Contents: TypeAlias = bytes | mmap.mmap
-ASC_BASE = re.compile(r"^\s*base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<times>absolute|relative))?", re.I | re.M)
 
 _SINCE_1970_NS = 100_000_000 * 1_000_000_000  # in 1973: no log is so old, and no vehicle runs for so long
 _MOST_BACK = 0.25  # share of the stamps that are before the one before: more are times since the frame before,
 _LONGEST_STEP_NS = 60 * 1_000_000_000  # if none is longer than this
 _MOST_UNPACKED = 4 << 30  # bytes: it is all in memory
+_UNPACKED_AT_ONCE = 1 << 20  # bytes
 _PIECE = 48 * BATCH  # characters of text that are parsed at once
 
 
@@ -55,26 +56,20 @@ def unpacked(path: Path, data: Contents, damage: Damage) -> Contents:
     """Unpack a gzipped log as far as possible; others are returned as they are."""
     if path.suffix.lower() != ".gz":
         return data
-    parts = []
-    position = size = 0
-    while position < len(data):
-        unpacker = zlib.decompressobj(wbits=31)
+    parts: list[bytes] = []
+    size = 0
+    with gzip.GzipFile(fileobj=BytesIO(data)) as stream:
         try:
-            while not unpacker.eof and position < len(data):
-                piece = data[position : position + 16384]
-                parts.append(unpacker.decompress(piece))
-                position += len(piece) - len(unpacker.unused_data)
-                size += len(parts[-1])
+            while piece := stream.read1(_UNPACKED_AT_ONCE):
+                parts.append(piece)
+                size += len(piece)
                 if size > _MOST_UNPACKED:
-                    damage.add(f"byte {position}", f"it unpacks to more than {_MOST_UNPACKED >> 30} GiB; the rest")
-                    return b"".join(parts)
-        except zlib.error as error:
+                    damage.add(f"byte {size} of what is packed", f"more than {_MOST_UNPACKED >> 30} GiB; the rest")
+                    break
+        except (OSError, EOFError, zlib.error) as error:
             if not parts:
                 raise InputError(f"{path}: not a gzip file ({error})") from None
-            damage.add(f"byte {position}", f"the gzip stream is broken ({error}); nothing after it can be read")
-            break
-        if not unpacker.eof:
-            damage.add(f"byte {len(data)}", "the gzip stream is cut off")
+            damage.add("the gzip stream", f"it is cut off or broken ({error}); nothing after it can be read")
     return b"".join(parts)
 
 

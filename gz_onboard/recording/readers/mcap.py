@@ -6,10 +6,10 @@ gives nothing of a file whose end is missing when it seeks, and stops at the fir
 
 from __future__ import annotations
 
-import contextlib
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -29,48 +29,108 @@ from gz_onboard.recording.readers.contents import Contents, Damage
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
-_FOOTER = struct.Struct("<BQQQL")  # opcode, length, start of the summary and of its offsets, CRC
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _ZSTD_CHUNK = b"\x04\x00\x00\x00zstd"
-_BROKEN = (ValueError, struct.error, EndOfFile)  # what reading a broken record raises
+_BROKEN = (ValueError, OverflowError, struct.error, EndOfFile)  # what reading a broken record raises
 _LARGEST_CHUNK = 64 << 20  # bytes, unpacked; ours have 300 kB
 
 _BLOCK_HEAD = struct.Struct("<BBHIqI")  # version, bytes of a step, kinds, frames, time of the first, unit of a step
 _KIND = np.dtype([("identifier", "<u4"), ("channel", "u1"), ("length", "u1")])
+_PARSERS: dict[int, Any] = {
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.STATISTICS: Statistics.read,
+}
+"""Of the records that are read whole when a log is opened."""
 
-_Record = tuple[int, Contents, int]
-"""Opcode, content, and the byte at which the record, or the chunk that holds it, begins in the file."""
+
+@dataclass(frozen=True)
+class Message:
+    """One entry of a topic. times: [ns]; place: the byte at which the chunk that holds it begins."""
+
+    channel: Channel
+    logged_ns: int
+    published_ns: int
+    data: bytes
+    place: int
+
+
+class LogContents:
+    """What one of our logs holds besides its messages, which `messages` reads. Broken records are noted as damage.
+
+    Raises InputError for a file that is no MCAP.
+    """
+
+    def __init__(self, path: Path, data: Contents, damage: Damage) -> None:
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.schemas: dict[int, bytes] = {}
+        self.channels: dict[int, Channel] = {}
+        self._promised_chunks = 0
+        self._data, self._damage = data, damage
+        self._records = list(_records(path, data, damage))
+        # The summary declares channels and schemas once more: they are known even where the first chunk is broken.
+        for opcode, start, end in self._records:
+            self._take(opcode, data, start, end)
+        missing = self._promised_chunks - sum(opcode == Opcode.CHUNK for opcode, _, _ in self._records)
+        if missing > 0 and not damage.count:
+            damage.add("in the middle", f"{missing} of {self._promised_chunks} chunks are missing", missing)
+
+    def messages(self) -> Iterator[Message]:
+        """The messages of all topics, in their order."""
+        for opcode, start, end in self._records:
+            if opcode != Opcode.CHUNK:
+                continue
+            try:
+                content = _unpack_chunk(self._data[start:end])
+                for inner, at, until in _split(content, 0, len(content)):
+                    if inner != Opcode.MESSAGE:
+                        self._take(inner, content, at, until)
+                        continue
+                    number, _, logged_ns, published_ns = _MESSAGE.unpack_from(content, at)
+                    if channel := self.channels.get(number):
+                        yield Message(channel, logged_ns, published_ns, content[at + _MESSAGE.size : until], start)
+            except _BROKEN as error:
+                self._damage.add(f"byte {start}", f"a chunk is broken ({error})")
+
+    def _take(self, opcode: int, data: Contents, start: int, end: int) -> None:
+        """Take what a record tells that is neither a chunk nor a message."""
+        if opcode not in _PARSERS:
+            return
+        try:
+            record = _PARSERS[opcode](ReadDataStream(BytesIO(data[start:end])))
+        except _BROKEN as error:
+            self._damage.add(f"byte {start}", f"a record is broken ({error})")
+            return
+        if isinstance(record, Attachment):
+            self.attachments[record.name] = record.data
+        elif isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+        elif isinstance(record, Schema):
+            self.schemas[record.id] = record.data
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+        else:
+            self._promised_chunks = record.chunk_count
 
 
 def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
     """Read the frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
-    channels: set[int] = set()
-    topics: set[str] = set()
-    promised = chunks = 0
+    contents = LogContents(path, data, damage)
     parts = []
-    for opcode, content, place in _unpacked(path, data, damage):
-        try:
-            if opcode == Opcode.MESSAGE:
-                if _MESSAGE.unpack_from(content)[0] in channels:
-                    parts.append(decode_block(content[_MESSAGE.size :]))
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(content))
-                topics.add(channel.topic)
-                if channel.message_encoding == framelog.ENCODING:
-                    channels.add(channel.id)
-            elif opcode == Opcode.STATISTICS:
-                promised = Statistics.read(_stream(content)).chunk_count
-            elif opcode == Opcode.CHUNK:
-                chunks += 1
-        except _BROKEN as error:
-            what = "block of frames" if opcode == Opcode.MESSAGE else "record"
-            damage.add(f"byte {place}", f"a {what} is broken ({error})")
-    if chunks < promised and not damage.count:
-        damage.add("in the middle", f"{promised - chunks} of {promised} chunks are missing", promised - chunks)
-    if not channels and topics:
+    for message in contents.messages():
+        if message.channel.message_encoding == framelog.ENCODING:
+            try:
+                parts.append(decode_block(message.data))
+            except ValueError as error:
+                damage.add(f"byte {message.place}", f"a block of frames is broken ({error})")
+    channels = contents.channels.values()
+    if channels and framelog.ENCODING not in {channel.message_encoding for channel in channels}:
         raise InputError(
             f"{path}: no raw frames in this MCAP file: it has no topic {framelog.TOPIC} in the encoding"
-            f" {framelog.ENCODING}, but {', '.join(sorted(topics)[:5])}"
+            f" {framelog.ENCODING}, but {', '.join(sorted(channel.topic for channel in channels)[:5])}"
         )
     return FrameColumns.concatenate(parts)
 
@@ -120,103 +180,38 @@ def _times(first: int, steps: np.ndarray[Any, Any], unit: int) -> np.ndarray[Any
     return np.where(np.abs(exact - times) < TIME_LIMIT_NS, times, -1)
 
 
-def attachments(path: Path, data: Contents) -> dict[str, bytes]:
-    """The attached files by name."""
-    found = {}
-    for opcode, content, _ in _records(path, data, Damage()):
-        if opcode == Opcode.ATTACHMENT:
-            with contextlib.suppress(*_BROKEN):
-                attachment = Attachment.read(_stream(content))
-                found[attachment.name] = attachment.data
-    return found
-
-
-def metadata(path: Path, data: Contents, record: str) -> dict[str, str]:
-    """The entries of the metadata record that is called so."""
-    entries: dict[str, str] = {}
-    for opcode, content, _ in _records(path, data, Damage()):
-        if opcode == Opcode.METADATA:
-            with contextlib.suppress(*_BROKEN):
-                found = Metadata.read(_stream(content))
-                entries = found.metadata if found.name == record else entries
-    return entries
-
-
-def json_channels(path: Path, data: Contents) -> dict[str, tuple[bytes, dict[str, str]]]:
-    """Schema (a JSON text) and metadata of each topic of JSON objects."""
-    schemas: dict[int, bytes] = {}
-    found = {}
-    for opcode, content, _ in _unpacked(path, data, Damage()):
-        with contextlib.suppress(*_BROKEN):
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(content))
-                schemas[schema.id] = schema.data
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(content))
-                if channel.message_encoding == "json":
-                    found[channel.topic] = (schemas.get(channel.schema_id, b"{}"), channel.metadata)
-    return found
-
-
-def samples(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, time of publishing [ns] and JSON text of the messages of the JSON topics."""
-    topics: dict[int, str] = {}
-    for opcode, content, place in _unpacked(path, data, damage):
-        try:
-            if opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(content))
-                if channel.message_encoding == "json":
-                    topics[channel.id] = channel.topic
-            elif opcode == Opcode.MESSAGE:
-                number, _, logged_ns, time_ns = _MESSAGE.unpack_from(content)
-                if number not in topics:
-                    continue
-                if (latest := max(logged_ns, time_ns)) >= TIME_LIMIT_NS:
-                    damage.add(f"a sample of {topics[number]}", f"{latest} ns is no time")
-                else:
-                    yield topics[number], time_ns, bytes(content[_MESSAGE.size :])
-        except _BROKEN as error:
-            damage.add(f"byte {place}", f"a record is broken ({error})")
-
-
-def _stream(content: Contents) -> ReadDataStream:
-    return ReadDataStream(BytesIO(content))
-
-
-def _unpacked(path: Path, data: Contents, damage: Damage) -> Iterator[_Record]:
-    """The records of the summary, then those of the data section; after each chunk the records in it."""
-    yield from _summary(data)
-    for opcode, content, place in _records(path, data, damage):
-        yield opcode, content, place
-        if opcode == Opcode.CHUNK:
-            try:
-                yield from _split(_unpack_chunk(content), place)
-            except _BROKEN as error:
-                damage.add(f"byte {place}", f"a chunk is broken ({error})")
-
-
-def _records(path: Path, data: Contents, damage: Damage) -> Iterator[_Record]:
-    """The records of the data section; after damage the next ones are those from the next chunk on."""
+def _records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the content of all records; after damage those from the next chunk on."""
     if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
         raise InputError(f"{path}: not an MCAP file: it does not begin with the format's magic bytes")
     position = len(MCAP0_MAGIC)
-    while position + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, position)
+    while position >= 0:
+        try:
+            for opcode, start, end in _split(data, position, len(data)):
+                if opcode == Opcode.FOOTER:
+                    return
+                yield opcode, start, end
+                position = end
+            damage.add(f"byte {len(data)}", "the file was cut off: it has no end record")
+            return
+        except ValueError as error:
+            following = _next_chunk(data, position + 1)
+            lost = f"{following - position} bytes are not records" if following > 0 else str(error)
+            damage.add(f"byte {position}", lost)
+            position = following
+
+
+def _split(data: Contents, position: int, limit: int) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the content of the records from `position` on. Raises ValueError where one is broken."""
+    while position < limit:
         start = position + _RECORD.size
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            return
-        if 0 < opcode <= Opcode.DATA_END and start + length <= len(data):
-            yield opcode, data[start : start + length], start
-            position = start + length
-            continue
-        following = _next_chunk(data, position + 1)
-        if following < 0:
-            why = "the file ends within a record" if opcode <= Opcode.DATA_END else "no record here"
-            damage.add(f"byte {position}", why)
-            return
-        damage.add(f"byte {position}", f"{following - position} bytes are not records")
-        position = following
-    damage.add(f"byte {len(data)}", "the file was cut off: it has no end record")
+        if start > limit:
+            raise ValueError("it ends within a record")
+        opcode, length = _RECORD.unpack_from(data, position)
+        position = start + length
+        if not 0 < opcode <= Opcode.DATA_END or position > limit:
+            raise ValueError("it ends within a record" if opcode else "no record here")
+        yield opcode, start, position
 
 
 def _next_chunk(data: Contents, position: int) -> int:
@@ -229,36 +224,6 @@ def _next_chunk(data: Contents, position: int) -> int:
             return found - offset
         found = data.find(_ZSTD_CHUNK, found + 1)
     return -1
-
-
-def _summary(data: Contents) -> list[_Record]:
-    """The records of the summary, which declares the channels even where the first chunk is broken; [] without one."""
-    footer = len(data) - len(MCAP0_MAGIC) - _FOOTER.size
-    if footer < 0 or data[footer + _FOOTER.size :] != MCAP0_MAGIC:
-        return []
-    opcode, _, start, _, crc = _FOOTER.unpack_from(data, footer)
-    end = footer + _FOOTER.size - 4
-    if opcode != Opcode.FOOTER or not len(MCAP0_MAGIC) <= start < footer or zlib.crc32(data[start:end]) != crc:
-        return []
-    try:
-        records = list(_split(data[start:footer], start))
-    except _BROKEN:
-        return []
-    return [record for record in records if record[0] in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)]
-
-
-def _split(content: bytes, place: int) -> Iterator[_Record]:
-    """The records in `content`. Raises ValueError where one is cut off."""
-    position = 0
-    while position < len(content):
-        start = position + _RECORD.size
-        if start > len(content):
-            raise ValueError("it ends within a record")
-        opcode, length = _RECORD.unpack_from(content, position)
-        position = start + length
-        if position > len(content):
-            raise ValueError("it ends within a record")
-        yield opcode, content[start:position], place
 
 
 def _unpack_chunk(content: Contents) -> bytes:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import importlib
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO, cast
 
 from gz_onboard.bus._can import can, flagged
 from gz_onboard.errors import InputError, shown
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED, Frame
-from gz_onboard.recording.frames import BATCH, FrameColumns
-from gz_onboard.recording.readers.contents import ASC_BASE, ChannelNumbers, Contents, Damage, text_pieces, timed
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.readers.contents import ChannelNumbers, Contents, Damage, Parser, read_lines
 
 _HEAD = 4000  # characters within which the base of an ASC log and the version of a trace stand
-_BEGINNING = 100  # characters that show a reader what a file is
+_SHOWN = 100  # characters that show a reader what a file is
 _ASC_STAMP = re.compile(r"\s*(\d+\.\d+)(?=\s)")
 _TRC_START = re.compile(r"^\s*(?:;\$FILEVERSION|\d+\)\s)", re.M)
 _TRC_FRAME = re.compile(r"\d+\)?\s")
@@ -25,76 +25,10 @@ _TRC_UP_TO_IDENTIFIER = re.compile(r"(;\$FILEVERSION=1\.)2|(\s*\d+\)(?:\s+\S+){4
 _ASC_LINE = re.compile(
     r"\s*(?:\d+\.\d+\s|//|date\b|base\b|(?:begin|end)\s+trigger|(?:no\s+)?internal\s+events|$)", re.I
 )
-_HEADERS = {".asc": ("date", "base", "//"), ".csv": ("timestamp",), ".trc": (";",)}
+_HEADERS = {".csv": ("timestamp",), ".trc": (";",)}  # what lines begin with that hold no frame
 _MASTER_CHANNELS = {"time", "t", "timestamps"}  # of an MF4
 # python-can's readers have no error of their own: these are what a line that is none raises in them.
 _BROKEN_LINE = (ValueError, LookupError, TypeError, AttributeError, NotImplementedError)
-
-
-class _LineFeed:
-    """Lines for python-can's text readers, counted; `resume` lets a reader go on after one that it choked on."""
-
-    def __init__(self, lines: Iterable[str], again: bool) -> None:
-        self._lines = iter(lines)
-        self._again = again
-        self.number = 0
-        self.line = ""
-        self.name = ""
-
-    def __iter__(self) -> _LineFeed:
-        return self
-
-    def __next__(self) -> str:
-        if self._again:
-            self._again = False
-            return "\n"
-        self.line = next(self._lines)
-        self.number += 1
-        return self.line
-
-    def resume(self) -> None:
-        """The reader will look for a header first: give it an empty line that it may drop."""
-        self._again = True
-
-    def close(self) -> None:
-        """Nothing is open; python-can closes what it reads."""
-
-
-def _asc_lines(lines: Iterable[str], damage: Damage, relative: bool) -> Iterator[str]:
-    """The lines of an ASC log; what is none is noted. relative: each time is that since the line before."""
-    now = 0.0
-    for number, line in enumerate(lines, 1):
-        if not _ASC_LINE.match(line):
-            damage.add(f"line {number}", f"not a line of an ASC log: {line.strip()[:60]!r}")
-        stamp = _ASC_STAMP.match(line) if relative else None
-        now += float(stamp[1]) if stamp else 0.0
-        yield f"{now:.9f}{line[stamp.end() :]}" if stamp else line
-
-
-def _as_1_3(line: str) -> str:
-    """A line of a PCAN trace of version 1.2 as one of 1.3, which has a column more."""
-    return _TRC_UP_TO_IDENTIFIER.sub(lambda m: f"{m[1]}3" if m[1] else f"{m[2]} -", line, count=1)
-
-
-def _opened(path: Path, suffix: str, data: Contents, damage: Damage) -> tuple[_LineFeed, can.io.generic.MessageReader]:
-    """The lines of a log and the reader that takes them."""
-    beginning = str(data[:_HEAD], "utf-8-sig", "replace")
-    lines: Iterable[str] = (line for piece in text_pieces(data) for line in piece.splitlines(keepends=True))
-    if suffix == ".csv":
-        feed = _LineFeed(lines, again=False)
-        return feed, can.CSVReader(cast("TextIO", feed))
-    if suffix == ".asc":
-        base = ASC_BASE.search(beginning)
-        relative = bool(base and (base["times"] or "").lower() == "relative")
-        # python-can takes the first line for a header, even if it is a frame
-        feed = _LineFeed(_asc_lines(lines, damage, relative), again=True)
-        return feed, can.ASCReader(cast("TextIO", feed), base["base"].lower() if base else "hex")
-    if not _TRC_START.search(beginning):
-        raise InputError(
-            f"{path}, line 1: not a PCAN trace: it has neither ';$FILEVERSION' nor lines that begin with '1)'"
-        )
-    feed = _LineFeed(map(_as_1_3, lines) if _TRC_1_2.search(beginning) else lines, again=False)
-    return feed, _TraceReader(cast("TextIO", feed))
 
 
 class _TraceReader(can.TRCReader):
@@ -108,34 +42,89 @@ class _TraceReader(can.TRCReader):
         return self._parse_cols(tuple(line.split(maxsplit=self._num_columns)))
 
 
+class _LineFile:
+    """One line as a file of python-can's readers. It stands there twice, for they take the first for a header."""
+
+    name = ""
+
+    def __init__(self, line: str = "") -> None:
+        self._lines = iter((line, line))
+
+    def __iter__(self) -> Iterator[str]:
+        return self._lines
+
+    def __next__(self) -> str:
+        return next(self._lines)
+
+    def close(self) -> None:
+        """Nothing is open; python-can closes what it reads."""
+
+
 def read(path: Path, suffix: str, data: Contents, damage: Damage) -> FrameColumns:
     """Read a log in the format of `suffix`; what cannot be read is noted as damage."""
     if suffix == ".mf4":
         return _read_mf4(path, data, damage)
-    feed, reader = _opened(path, suffix, data, damage)
+    beginning = str(data[:_HEAD], "utf-8-sig", "replace")
+    if suffix == ".asc":
+        return read_lines(path, data, damage, _asc_parser(), "an ASC log")
+    if suffix == ".trc":
+        if not _TRC_START.search(beginning):
+            raise InputError(
+                f"{path}, line 1: not a PCAN trace: it has neither ';$FILEVERSION' nor lines that begin with '1)'"
+            )
+        as_read = _as_1_3 if _TRC_1_2.search(beginning) else str
+        parse = _parser(_TraceReader(cast("TextIO", _LineFile())), suffix)
+        return read_lines(path, data, damage, lambda line: parse(as_read(line)), "a PCAN trace")
+    try:
+        reader = can.CSVReader(cast("TextIO", _LineFile()))
+        return read_lines(path, data, damage, _parser(reader, suffix), "python-can's CSV")
+    except InputError:
+        raise InputError(
+            f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, in "
+            "UTF-8 and with a column 'time [s]', or one that [table] in a vehicle file names; it begins with "
+            f"{shown(beginning.partition(chr(10))[0][:_SHOWN])}"
+        ) from None
+
+
+def _parser(reader: Any, suffix: str) -> Parser:
+    """Parse lines by one of python-can's readers, which keeps what the header says."""
     channels = ChannelNumbers()
-    messages = iter(reader)
-    parts: list[FrameColumns] = []
-    batch: list[Frame] = []
-    while True:
+    header = _HEADERS.get(suffix, ())
+
+    def parse(line: str) -> Frame | None:
+        reader.file = _LineFile(line)
+        is_header = line.lstrip().lower().startswith(header)
         try:
-            message = next(messages, None)
-            if message is None:
-                break
-            batch.append(frame_of(_checked(message, suffix), channels))
+            message = next(iter(reader), None)
+            return None if is_header or message is None else frame_of(_checked(message, suffix), channels)
         except _BROKEN_LINE as error:
-            damage.add(f"line {feed.number}", f"{str(error) or type(error).__name__}: {feed.line.strip()[:60]!r}")
-            if not parts and not batch and damage.count >= BATCH:
-                break
-            feed.resume()
-            messages = iter(reader)
-        if len(batch) >= BATCH:
-            parts.append(FrameColumns.of(batch))
-            batch = []
-    parts.append(FrameColumns.of(batch))
-    if not any(map(len, parts)) and feed.number:
-        _refuse(path, suffix, data, damage)
-    return timed(FrameColumns.concatenate(parts), damage)
+            if is_header:
+                return None
+            raise ValueError(str(error) or type(error).__name__) from None
+
+    return parse
+
+
+def _asc_parser() -> Parser:
+    """Parse lines of an ASC log; where its times are relative, each is that since the line before."""
+    reader = can.ASCReader(cast("TextIO", _LineFile()))
+    parse_line, now = _parser(reader, ".asc"), 0.0
+
+    def parse(line: str) -> Frame | None:
+        nonlocal now
+        if not _ASC_LINE.match(line):
+            raise ValueError("not a line of an ASC log")
+        if reader.timestamps_format == "relative" and (stamp := _ASC_STAMP.match(line)):
+            now += float(stamp[1])
+            line = f"{now:.9f}{line[stamp.end() :]}"
+        return parse_line(line)
+
+    return parse
+
+
+def _as_1_3(line: str) -> str:
+    """A line of a PCAN trace of version 1.2 as one of 1.3, which has a column more."""
+    return _TRC_UP_TO_IDENTIFIER.sub(lambda m: f"{m[1]}3" if m[1] else f"{m[2]} -", line, count=1)
 
 
 def _checked(message: can.Message, suffix: str) -> can.Message:
@@ -147,20 +136,6 @@ def _checked(message: can.Message, suffix: str) -> can.Message:
     if len(message.data) != length and not (message.is_remote_frame or message.is_error_frame):
         raise ValueError(f"{len(message.data)} bytes of data where there should be {length}")
     return message
-
-
-def _refuse(path: Path, suffix: str, data: Contents, damage: Damage) -> None:
-    """InputError for a text without any frame, unless it has the header of its format and no damage."""
-    if damage.count and suffix == ".csv":
-        raise InputError(
-            f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, in "
-            "UTF-8 and with a column 'time [s]', or one that [table] in a vehicle file names; it begins with "
-            f"{shown(str(data[:_BEGINNING], 'latin-1').partition(chr(10))[0])}"
-        )
-    if damage.count:
-        raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}")
-    if not str(data[:_BEGINNING], "latin-1").lstrip().lower().startswith(_HEADERS[suffix]):
-        raise InputError(f"{path}, line 1: not a log in the format {suffix}: it has no header of that format")
 
 
 def _read_mf4(path: Path, data: Contents, damage: Damage) -> FrameColumns:
