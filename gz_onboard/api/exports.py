@@ -17,7 +17,7 @@ from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.options import LONGEST_LOG
 from gz_onboard.recording import tables
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.logs import LogDamage
+from gz_onboard.recording.readers.contents import LogDamage
 
 _KINDS = {int: np.int64, bool: bool, str: object}
 

@@ -25,7 +25,7 @@ from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
 from gz_onboard.recording.decode import decode_columns
 from gz_onboard.recording.frames import BATCH, FrameColumns
-from gz_onboard.recording.logs import LogDamage
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.timeline import stray
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle

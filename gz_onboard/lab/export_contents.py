@@ -13,6 +13,7 @@ from gz_onboard.bus.codec import BACK_NS
 from gz_onboard.lab.export_tables import recorded_messages
 from gz_onboard.offline.results import clock, text_rows
 from gz_onboard.recording import logs
+from gz_onboard.recording.readers.contents import LogDamage
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Contents:
 
 def log_contents(log: Path) -> Contents:
     """What `log` holds, by reading it whole; InputError if it cannot be read."""
-    damages: list[logs.LogDamage] = []
+    damages: list[LogDamage] = []
     frames = logs.read_log(log, on_damage=damages.append)
     stamps = frames.time_ns
     back = int((stamps < np.maximum.accumulate(stamps) - BACK_NS).sum())

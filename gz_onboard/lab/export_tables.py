@@ -15,6 +15,7 @@ from gz_onboard.errors import InputError, nearest
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC, table_columns
 from gz_onboard.recording import logs, tables
 from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.replay import log_section
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
@@ -34,7 +35,7 @@ class Source:
     start: float = 0.0
     end: float | None = None
     columns: Sequence[str] | None = None
-    damages: list[logs.LogDamage] = field(default_factory=list)
+    damages: list[LogDamage] = field(default_factory=list)
 
     def frames(self) -> tuple[tuple[int | None, int | None], FrameColumns]:
         """(the part that is wanted [ns since the epoch], its frames); InputError if there are none."""

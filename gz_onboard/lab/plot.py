@@ -37,7 +37,8 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import PICTURE_FORMATS, add_shared
-from gz_onboard.recording.logs import LogDamage, logs_among, read_metadata
+from gz_onboard.recording.logs import logs_among, read_metadata
+from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,8 @@ from gz_onboard.offline.signal_table import SignalTable, read_table, signal_fram
 from gz_onboard.options import MOST_PAYLOAD
 from gz_onboard.recording.decode import decode_columns
 from gz_onboard.recording.frames import BATCH, FrameColumns
-from gz_onboard.recording.logs import LogDamage, is_table, log_stem, read_log
+from gz_onboard.recording.logs import is_table, log_stem, read_log
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.timeline import stray
 from gz_onboard.vehicle import Vehicle
 

@@ -27,7 +27,7 @@ from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
-from gz_onboard.recording.readers.contents import Damage, unpacked
+from gz_onboard.recording.readers.contents import LogDamage, unpacked
 from gz_onboard.routes.columns import separated
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def _is_parquet(file: Path) -> bool:
 
 def _csv(file: Path) -> tuple[list[str], Rows]:
     try:
-        data = bytes(unpacked(file, file.read_bytes(), Damage()))
+        data = bytes(unpacked(file.read_bytes(), LogDamage(file)))
     except OSError as error:
         raise unreadable(file, error) from error
     try:

@@ -18,7 +18,6 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -28,27 +27,27 @@ from mcap.writer import MCAP0_MAGIC
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
 from gz_onboard.events import MOST_EXTENDED, Frame
 from gz_onboard.recording.frames import FD_LENGTHS, TIME_LIMIT_NS, FrameColumns
-from gz_onboard.recording.readers import blf, candump, lines, mcap
-from gz_onboard.recording.readers.contents import Contents, Damage, Reader, unpacked
+from gz_onboard.recording.readers import blf, mcap, text
+from gz_onboard.recording.readers.contents import Contents, LogDamage, Reader, unpacked
 
 _LOG = logging.getLogger(__name__)
 
 _SAVVYCAN, _TABLE = "SavvyCAN's CSV", "a table"
 
 
-def _refuse_table(path: Path, _data: Contents, _damage: Damage) -> FrameColumns:
+def _refuse_table(_data: Contents, damage: LogDamage) -> FrameColumns:
     raise InputError(
-        f"{path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
+        f"{damage.path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
     )
 
 
 def _python_can(suffix: str) -> Reader:
     """The reader of a format that python-can reads, which is imported when it is needed."""
 
-    def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
+    def read(data: Contents, damage: LogDamage) -> FrameColumns:
         from gz_onboard.recording.readers import python_can
 
-        return python_can.read(path, suffix, data, damage)
+        return python_can.read(suffix, data, damage)
 
     return read
 
@@ -56,10 +55,10 @@ def _python_can(suffix: str) -> Reader:
 _READERS: dict[str, Reader] = {
     ".mcap": mcap.read,
     ".blf": blf.read,
-    ".log": candump.read,
+    ".log": text.read_candump,
     **{suffix: _python_can(suffix) for suffix in (".asc", ".csv", ".trc", ".mf4")},
-    ".crtd": lines.read_crtd,
-    _SAVVYCAN: lines.read_savvycan,
+    ".crtd": text.read_crtd,
+    _SAVVYCAN: text.read_savvycan,
     _TABLE: _refuse_table,
 }
 _MAGIC = {b"LOGG": ".blf", MCAP0_MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
@@ -75,35 +74,21 @@ _FOREIGN_FORMATS = {
 }
 """Logs of other tools, by what they begin with, and what to do with them."""
 _FIRST_LINES = {
-    _SAVVYCAN: lines.SAVVYCAN_HEADER,
+    _SAVVYCAN: text.SAVVYCAN_HEADER,
     ".csv": re.compile(r"timestamp,arbitration_id,"),
     ".asc": re.compile(
         r"\s*base\s+(?:hex|dec)|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
         re.I,
     ),
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
-    ".crtd": lines.CRTD_LINE,
-    ".log": re.compile(rf"(?:{candump.LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
+    ".crtd": text.CRTD_LINE,
+    ".log": re.compile(rf"(?:{text.CANDUMP_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
 _TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
 ESTIMATED = ".estimate.mcap"
 """The end of the name of what ``gz-onboard estimate`` writes."""
 _HEAD = 8192  # bytes within which a text log shows what it is
-
-
-@dataclass(frozen=True)
-class LogDamage:
-    """What could not be read of a log: how many pieces (lines, objects, chunks), and the first of them."""
-
-    path: Path
-    count: int
-    place: str
-    reason: str
-
-    def __str__(self) -> str:
-        more = f" and {self.count - 1} more" if self.count > 1 else ""
-        return f"{self.path}: {self.place}: {self.reason}{more}: skipped"
 
 
 def read_log(
@@ -119,17 +104,15 @@ def read_log(
     missing or not of the format that its content or name says.
     """
     path = Path(path)
-    suffix, damage = log_suffix(path), Damage()
-    frames = _READERS[suffix](path, unpacked(path, _load(path), damage), damage)
+    suffix, damage = log_suffix(path), LogDamage(path)
+    frames = _READERS[suffix](unpacked(_load(path), damage), damage)
     impossible = frames.impossible()
     if impossible.any():
         for frame in frames[impossible].tuples():
             damage.add("a frame", _problem(frame))
         frames = frames[~impossible]
-    for note in damage.notes:
-        _LOG.warning("%s: %s", path, note)
     if damage.count:
-        (on_damage or _warn)(LogDamage(path, damage.count, damage.place, damage.reason))
+        (on_damage or _warn)(damage)
     return frames.between(start_ns, end_ns)
 
 
@@ -266,19 +249,19 @@ def _is_log(file: Path, estimates: bool | None) -> bool:
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
     """The files attached to one of our own logs by name, such as the DBC files; of other formats none."""
-    own = _own(path, Damage())
+    own = _own(LogDamage(Path(path)))
     return own.attachments if own else {}
 
 
 def read_metadata(path: str | Path, record: str = "gz_onboard") -> dict[str, str]:
     """The metadata of one of our own logs (vehicle, version, ...), or another record of it; of other formats none."""
-    own = _own(path, Damage())
+    own = _own(LogDamage(Path(path)))
     return own.metadata.get(record, {}) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
     """Schema (a JSON text) and metadata of each topic of samples in one of our own logs; of other formats none."""
-    if not (own := _own(path, Damage())):
+    if not (own := _own(LogDamage(Path(path)))):
         return {}
     if not own.channels:  # only the chunks of a log that was cut off declare them
         deque(own.messages(), maxlen=0)
@@ -297,8 +280,8 @@ def read_samples(
     start_ns, end_ns, on_damage: as of `read_log`; without on_damage damage is passed over, for one who reads the frames
     too.
     """
-    path, damage = Path(path), Damage()
-    own = _own(path, damage)
+    damage = LogDamage(Path(path))
+    own = _own(damage)
     for message in own.messages() if own else ():
         topic, time_ns = message.channel.topic, message.published_ns
         if message.channel.message_encoding != "json":
@@ -310,14 +293,13 @@ def read_samples(
                 if isinstance(values := json.loads(message.data), dict):
                     yield topic, time_ns, values
     if damage.count and on_damage:
-        on_damage(LogDamage(path, damage.count, damage.place, damage.reason))
+        on_damage(damage)
 
 
-def _own(path: str | Path, damage: Damage) -> mcap.LogContents | None:
+def _own(damage: LogDamage) -> mcap.LogContents | None:
     """A log in our own format; None of another. InputError for one that is not there."""
-    path = Path(path)
-    form, data = log_suffix(path), _load(path)
-    return mcap.LogContents(path, unpacked(path, data, damage), damage) if form == ".mcap" else None
+    form, data = log_suffix(damage.path), _load(damage.path)
+    return mcap.LogContents(unpacked(data, damage), damage) if form == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:

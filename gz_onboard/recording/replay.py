@@ -23,7 +23,8 @@ from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.logs import LogDamage, log_suffix, logs_among, read_log
+from gz_onboard.recording.logs import log_suffix, logs_among, read_log
+from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
     import can

@@ -23,6 +23,7 @@ from gz_onboard.bus.recorder import Limits, Recorder, is_complete
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 from gz_onboard.recording import logs
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.readers.mcap import decode_block
 
 START = 1_750_000_000_000_000_000  # 2025-06-15T15:06:40Z
@@ -127,7 +128,7 @@ def test_a_file_cut_off_at_any_time_is_readable_up_to_the_last_two_seconds(tmp_p
     copy = tmp_path / "copy" / "cut.mcap"
     copy.parent.mkdir()
     copy.write_bytes(log.path.read_bytes())
-    damages: list[logs.LogDamage] = []
+    damages: list[LogDamage] = []
     there = [frame for batch in logs.read_frames(copy, on_damage=damages.append) for frame in batch]
     assert there == flat(batches)[: len(there)]
     end = there[-1][0] if there else START
@@ -418,7 +419,7 @@ def test_a_log_cut_off_anywhere_is_read_as_far_as_it_was_synced(tmp_path: Path) 
     source = random.Random(2)
     for number, length in enumerate([there, there - 1, *(source.randrange(2000, there) for _ in range(60))]):
         path.write_bytes(data[:length] + (b"", bytes(3000), source.randbytes(3000))[number % 3])
-        damages: list[logs.LogDamage] = []
+        damages: list[LogDamage] = []
         found = [frame for batch in logs.read_frames(path, on_damage=damages.append) for frame in batch]
         assert found == sent[: len(found)]
         assert len(damages) == 1

@@ -28,7 +28,8 @@ from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS
-from gz_onboard.recording.logs import LogDamage, read_frames
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.readers.contents import LogDamage
 from tests.hardening import _ext4
 from tests.hardening.report import Report
 from tests.support import S, Scooter, reference

@@ -16,7 +16,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import Cause, Explanation, words
 from gz_onboard.lab import logged, plot
 from gz_onboard.lab.why import draw_why
-from gz_onboard.recording.logs import LogDamage
+from gz_onboard.recording.readers.contents import LogDamage
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
 

@@ -23,16 +23,10 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export
 from gz_onboard.recording import logs
-from gz_onboard.recording.logs import (
-    LogDamage,
-    json_channels,
-    read_attachments,
-    read_frames,
-    read_metadata,
-    read_samples,
-)
-from gz_onboard.recording.readers.contents import ChannelNumbers
+from gz_onboard.recording.logs import json_channels, read_attachments, read_frames, read_metadata, read_samples
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.readers.python_can import frame_of
+from gz_onboard.recording.readers.text import ChannelNumbers
 from gz_onboard.recording.writers import write_blf, write_candump
 
 START_S = 1_750_000_000

@@ -23,7 +23,8 @@ from gz_onboard.bus.dbc import load_database
 from gz_onboard.bus.mapping import pgn, read_mapping
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Event, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.logs import LogDamage, read_frames
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import Vehicle, read_vehicle
 

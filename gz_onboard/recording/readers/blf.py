@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 import zlib
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED
 from gz_onboard.recording.frames import LATEST_NS, FrameColumns
-from gz_onboard.recording.readers.contents import Contents, Damage
+from gz_onboard.recording.readers.contents import Contents, LogDamage
 
 _FILE = struct.Struct("<4sL8B2Q2L8H8H")
 _HEAD = struct.Struct("<4sHHLL")  # signature, header size, header version, object size, object type
@@ -62,10 +61,10 @@ _IDENTIFIER = EFF_FLAG | MOST_EXTENDED
 _AFTER = bytes(256)  # so that a record may be read where the content ends
 
 
-def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
+def read(data: Contents, damage: LogDamage) -> FrameColumns:
     """Read the frames of a BLF file; note as damage what cannot be read."""
     if len(data) < _FILE.size or data[:4] != b"LOGG":
-        raise InputError(f"{path}: not a BLF file: it does not begin with LOGG and a header")
+        raise InputError(f"{damage.path}: not a BLF file: it does not begin with LOGG and a header")
     header = _FILE.unpack_from(data)
     start_ns, position, promised = _file_start(header[14:22]), header[1], header[12]
     objects, tail, parts = 0, b"", []
@@ -131,7 +130,7 @@ def _unpack(data: Contents, position: int, end: int) -> tuple[bytes, bool]:
     return content, unpacker.eof and len(unpacker.unused_data) < 4
 
 
-def _starts(content: bytes, damage: Damage, place: str) -> tuple[NDArray[np.int64], bytes]:
+def _starts(content: bytes, damage: LogDamage, place: str) -> tuple[NDArray[np.int64], bytes]:
     """Find where the whole objects of `content` begin; also return the rest, which the next container completes."""
     letters = np.flatnonzero(np.frombuffer(content, np.uint8) == _SIGNATURE[0])
     padded = content + _AFTER
@@ -169,7 +168,7 @@ def _records(content: bytes, at: NDArray[np.int64], layout: np.dtype[Any]) -> ND
     return everywhere[at].view(layout)
 
 
-def _frames(content: bytes, starts: NDArray[np.int64], start_ns: int, damage: Damage, place: str) -> FrameColumns:
+def _frames(content: bytes, starts: NDArray[np.int64], start_ns: int, damage: LogDamage, place: str) -> FrameColumns:
     """Return the frames among the objects that begin at `starts`; an object too short for its type is damage."""
     objects = _records(content, starts, _OBJECT)
     has_fd = bool(np.isin(objects["kind"], (_FD_MESSAGE, _FD_MESSAGE_64)).any())

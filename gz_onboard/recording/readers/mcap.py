@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from mcap.writer import MCAP0_MAGIC
 from gz_onboard.bus import framelog
 from gz_onboard.errors import InputError
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
-from gz_onboard.recording.readers.contents import Contents, Damage
+from gz_onboard.recording.readers.contents import Contents, LogDamage
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
@@ -63,14 +62,14 @@ class LogContents:
     Raises InputError for a file that is no MCAP.
     """
 
-    def __init__(self, path: Path, data: Contents, damage: Damage) -> None:
+    def __init__(self, data: Contents, damage: LogDamage) -> None:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, bytes] = {}
         self.channels: dict[int, Channel] = {}
         self._promised_chunks = 0
         self._data, self._damage = data, damage
-        self._records = list(_records(path, data, damage))
+        self._records = list(_records(data, damage))
         # The summary declares channels and schemas once more: they are known even where the first chunk is broken.
         for opcode, start, end in self._records:
             self._take(opcode, data, start, end)
@@ -116,9 +115,9 @@ class LogContents:
             self._promised_chunks = record.chunk_count
 
 
-def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
+def read(data: Contents, damage: LogDamage) -> FrameColumns:
     """Read the frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
-    contents = LogContents(path, data, damage)
+    contents = LogContents(data, damage)
     parts = []
     for message in contents.messages():
         if message.channel.message_encoding == framelog.ENCODING:
@@ -129,7 +128,7 @@ def read(path: Path, data: Contents, damage: Damage) -> FrameColumns:
     channels = contents.channels.values()
     if channels and framelog.ENCODING not in {channel.message_encoding for channel in channels}:
         raise InputError(
-            f"{path}: no raw frames in this MCAP file: it has no topic {framelog.TOPIC} in the encoding"
+            f"{damage.path}: no raw frames in this MCAP file: it has no topic {framelog.TOPIC} in the encoding"
             f" {framelog.ENCODING}, but {', '.join(sorted(channel.topic for channel in channels)[:5])}"
         )
     return FrameColumns.concatenate(parts)
@@ -180,10 +179,10 @@ def _times(first: int, steps: np.ndarray[Any, Any], unit: int) -> np.ndarray[Any
     return np.where(np.abs(exact - times) < TIME_LIMIT_NS, times, -1)
 
 
-def _records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
+def _records(data: Contents, damage: LogDamage) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the content of all records; after damage those from the next chunk on."""
     if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
-        raise InputError(f"{path}: not an MCAP file: it does not begin with the format's magic bytes")
+        raise InputError(f"{damage.path}: not an MCAP file: it does not begin with the format's magic bytes")
     position = len(MCAP0_MAGIC)
     while position >= 0:
         try:

@@ -13,7 +13,8 @@ from gz_onboard.bus._can import can, flagged
 from gz_onboard.errors import InputError, shown
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.readers.contents import ChannelNumbers, Contents, Damage, Parser, read_lines
+from gz_onboard.recording.readers.contents import Contents, LogDamage
+from gz_onboard.recording.readers.text import ChannelNumbers, Parser, read_lines
 
 _HEAD = 4000  # characters within which the base of an ASC log and the version of a trace stand
 _SHOWN = 100  # characters that show a reader what a file is
@@ -60,27 +61,28 @@ class _LineFile:
         """Nothing is open; python-can closes what it reads."""
 
 
-def read(path: Path, suffix: str, data: Contents, damage: Damage) -> FrameColumns:
+def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
     """Read a log in the format of `suffix`; what cannot be read is noted as damage."""
     if suffix == ".mf4":
-        return _read_mf4(path, data, damage)
+        return _read_mf4(data, damage)
     beginning = str(data[:_HEAD], "utf-8-sig", "replace")
     if suffix == ".asc":
-        return read_lines(path, data, damage, _asc_parser(), "an ASC log")
+        return read_lines(data, damage, _asc_parser(), "an ASC log")
     if suffix == ".trc":
         if not _TRC_START.search(beginning):
             raise InputError(
-                f"{path}, line 1: not a PCAN trace: it has neither ';$FILEVERSION' nor lines that begin with '1)'"
+                f"{damage.path}, line 1: not a PCAN trace: it has neither ';$FILEVERSION' nor lines that "
+                "begin with '1)'"
             )
         as_read = _as_1_3 if _TRC_1_2.search(beginning) else str
         parse = _parser(_TraceReader(cast("TextIO", _LineFile())), suffix)
-        return read_lines(path, data, damage, lambda line: parse(as_read(line)), "a PCAN trace")
+        return read_lines(data, damage, lambda line: parse(as_read(line)), "a PCAN trace")
     try:
         reader = can.CSVReader(cast("TextIO", _LineFile()))
-        return read_lines(path, data, damage, _parser(reader, suffix), "python-can's CSV")
+        return read_lines(data, damage, _parser(reader, suffix), "python-can's CSV")
     except InputError:
         raise InputError(
-            f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, in "
+            f"{damage.path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, in "
             "UTF-8 and with a column 'time [s]', or one that [table] in a vehicle file names; it begins with "
             f"{shown(beginning.partition(chr(10))[0][:_SHOWN])}"
         ) from None
@@ -138,9 +140,9 @@ def _checked(message: can.Message, suffix: str) -> can.Message:
     return message
 
 
-def _read_mf4(path: Path, data: Contents, damage: Damage) -> FrameColumns:
+def _read_mf4(data: Contents, damage: LogDamage) -> FrameColumns:
     """Read the frames of an MF4 file; needs asammdf."""
-    with_asammdf(path)
+    with_asammdf(damage.path)
     channels = ChannelNumbers()
     frames: list[Frame] = []
     try:
@@ -148,12 +150,12 @@ def _read_mf4(path: Path, data: Contents, damage: Damage) -> FrameColumns:
         frames.extend(frame_of(message, channels) for message in reader)
     except Exception as error:  # asammdf raises all sorts of exceptions for a broken file
         if not frames:
-            raise InputError(f"{path}: not a readable MF4 file: {error}") from None
+            raise InputError(f"{damage.path}: not a readable MF4 file: {error}") from None
         damage.add("after the last frame read", str(error))
     if not frames and (signals := sorted(set(reader._mdf.channels_db) - _MASTER_CHANNELS)):
         raise InputError(
-            f"{path}: holds signals ({', '.join(signals[:3])}{', ...' if len(signals) > 3 else ''}) and no frames; "
-            "save it as Parquet, which is read as a table of signals"
+            f"{damage.path}: holds signals ({', '.join(signals[:3])}{', ...' if len(signals) > 3 else ''}) "
+            "and no frames; save it as Parquet, which is read as a table of signals"
         )
     return FrameColumns.of(frames)
 
