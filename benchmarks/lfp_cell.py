@@ -20,9 +20,9 @@ import numpy as np
 from benchmarks.real_cell import INTERVAL, MARK, NEAR, RIGHT_SD, WRONG
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as gz_onboard
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 BASE = Path(__file__).with_name("a123.toml")
 TESTS = {"N15": -15.0, "P05": 5.0, "P25": 25.0, "P45": 45.0}  # degC, by the names of the files
@@ -60,7 +60,7 @@ def errors(work: tuple[Path, Path, str, float]) -> tuple[Array, Array, Array]:
     truth = 1 - rows[:, 3] / capacity
     vehicle = read_vehicle(vehicle_file)
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-    estimator = Estimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
+    estimator = EventEstimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
     estimator._outlook._time = float("inf")  # no range is asked for
     found = np.full((2, len(rows)), np.nan)
     told = False

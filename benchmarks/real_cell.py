@@ -21,7 +21,6 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.estimator.ekf import Covariance, Noise, ScalarFilter, SocFilter
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.uncertainty import UNCHECKED_SD
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
@@ -34,6 +33,7 @@ from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 TEMPERATURES = (25, 10, 0, -10, -20)
 OFFSET = 0.05  # A of the cell: what the current sensor shows too much
@@ -222,7 +222,7 @@ class Score:
     sd: float  # mean
 
 
-def estimator_of(setting: Setting, offset: float) -> Estimator:
+def estimator_of(setting: Setting, offset: float) -> EventEstimator:
     """The estimator on board of the cell, with a current sensor whose offset has the sd `offset` [A]."""
     battery, result = setting.battery, setting.result
     vehicle = read_vehicle("reference")
@@ -245,7 +245,7 @@ def estimator_of(setting: Setting, offset: float) -> Estimator:
     beside = {**result.effects, **({"slow_relaxation": False} if setting.slow else {})}
     model = Model(tuple(e for e in vehicle.model.effects if beside.get(e.name, True)), Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-    estimator = Estimator(groups, battery, model, vehicle.riding, setting.make)
+    estimator = EventEstimator(groups, battery, model, vehicle.riding, setting.make)
     estimator._outlook._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
     cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.forecaster.load

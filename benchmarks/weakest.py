@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks.range_rides import EMPTY, GIVES_UP, draw, road_of
 from gz_onboard.arrays import Array
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Event, Group
+from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, EventEstimator
 from tests.plant.machine import scooter
 from tests.plant.ride import STEP, Hidden, ride
 from tests.plant.sensors import measure
@@ -83,10 +83,10 @@ def events(columns: Columns, lowest: Any = None) -> Iterator[Event]:
     yield from sorted(rows, key=lambda row: row[0])
 
 
-def estimates(columns: Columns, lowest: Any = None) -> tuple[list[Any], Estimator]:
+def estimates(columns: Columns, lowest: Any = None) -> tuple[list[Any], EventEstimator]:
     """An estimate each second, and the estimator at the end."""
     vehicle = read_vehicle("reference")
-    estimator, made = Estimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding), []
+    estimator, made = EventEstimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding), []
     due = 0.0
     for event in events(columns, lowest):
         estimator.handle(event)

@@ -1,7 +1,7 @@
-"""What crosses the borders between the packages: frames, events and estimates.
+"""Data that the packages exchange: frames, windows and estimates.
 
-Frames and events are plain tuples, because hundreds of them pass each second: building a tuple costs a
-fifth of building a dataclass.
+Frames are plain tuples, because hundreds of them pass each second: building a tuple costs a fifth of building a
+dataclass.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 Frame: TypeAlias = tuple[int, int, bytes, int]
 """(time [ns since the epoch], identifier, data, channel).
@@ -29,16 +29,36 @@ def hexadecimal(identifier: int) -> str:
     return f"{identifier & ~EFF_FLAG:#0{10 if identifier & EFF_FLAG else 5}x}"
 
 
-Event: TypeAlias = tuple[float, int, tuple[float | None, ...]]
-"""(time [s, on the codec's monotonic timeline], group, values in SI units).
+class RoleWindow(NamedTuple):
+    """Samples of one role in one window, in SI units."""
 
-A group is one mapped message: ``Codec.groups[group]`` names the roles that the values belong to, in order.
-None stands for a value that was not available, implausible or dropped."""
+    time: float  # s, of the last sample
+    value: float  # of the last sample
+    samples: int
+    mean: float
+    mean_square: float | None = None  # only of `SQUARED` roles
+
+
+class MessageWindow(NamedTuple):
+    """Frames of one message in one window; None stands for a role without a valid sample.
+
+    group: index into ``Codec.groups``, which names the roles.
+    """
+
+    group: int
+    time: float  # s, of the last frame, on the codec's monotonic timeline
+    frames: int
+    roles: tuple[RoleWindow | None, ...]
+
+
+WINDOW = 0.5  # s between two steps of the estimator
+SQUARED = frozenset({"accel_z"})
+"""Roles whose variation within a window matters: the road shakes the vertical accelerometer."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """One mapped message: its events carry the values of these roles, in this order."""
+    """One mapped message and the roles of its signals, in order."""
 
     message: str
     roles: tuple[str, ...]

@@ -1,7 +1,7 @@
 """Codec, estimator, publisher and recorder in one row: the same for a live bus, a replayed log and an offline estimate.
 
-Time is that of the frames. Estimates are made on a grid of 0.1 s of that time, so it does not matter in what
-portions the frames arrive.
+Time is that of the frames. Windows of half a second end on a grid of that time, so it does not matter in what
+portions the frames arrive. At the end of each the estimator makes a step and an estimate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State, hexadecimal
+from gz_onboard.events import EFF_FLAG, WINDOW, Estimate, Frame, Reason, State, hexadecimal
 from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_TOPIC, location_row
 from gz_onboard.log_rows import (
     CHANGE_TOPIC,
@@ -41,7 +41,9 @@ from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz
+TICKS_PER_WINDOW = round(WINDOW * 1e9 / TICK_NS)
 TICKS_PER_RANGE = 10  # range at 1 Hz
+WINDOW_NS = TICKS_PER_WINDOW * TICK_NS
 FREE = (
     *range(0x600, 0x700, 0x10),
     *range(0x10, 0x600, 0x10),
@@ -65,7 +67,7 @@ class Pipeline:
     """From the frames of one vehicle to its estimates.
 
     log: where to write, if anywhere; log_frames, log_signals: also the raw frames, and each message's latest
-    signals once a second. observer: called with each estimate made, ten times a second of the frames' time.
+    signals once a second. observer: called with each estimate made, at the end of each window.
     """
 
     def __init__(
@@ -113,9 +115,9 @@ class Pipeline:
             self._next_ns = (frames[0][0] if frames else until_ns) + TICK_NS
         out: list[Frame] = []
         if not -10 * TICK_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
-            self._take(frames)
-            self._next_ns = until_ns
-            frames = ()
+            self._close_window(self._next_ns)
+            begin = frames[0][0] if frames and self._next_ns <= frames[0][0] <= until_ns else until_ns
+            self._next_ns -= (self._next_ns - begin) // WINDOW_NS * WINDOW_NS  # on the same grid
         done = 0
         while self._next_ns <= until_ns:
             end = bisect_left(frames, (self._next_ns,), done)
@@ -135,19 +137,33 @@ class Pipeline:
             self._next_ns += delta_ns
 
     def _take(self, frames: Sequence[Frame]) -> None:
-        handle = self.estimator.handle
-        for event in self.codec.decode(frames):
-            handle(event)
+        self.codec.decode(frames)
         if self._log and self._log_frames:
             self._log.frames(frames)
 
     def _tick(self, time_ns: int) -> list[Frame]:
-        codec = self.codec
         whole_second = self._ticks % TICKS_PER_RANGE == 0
-        self._ticks += 1
         if whole_second:
             self._count_faults()
-        estimate = self.estimator.estimate(codec.seconds(time_ns))
+        if self._ticks % TICKS_PER_WINDOW == 0 or self.last is None:
+            self._close_window(time_ns)
+        self._ticks += 1
+        assert self.last is not None
+        sent = self.publisher.status(self.last, time_ns)
+        if whole_second:
+            sent += self.publisher.range(self.last, self.counts(), time_ns)
+        if self._log:
+            if self._log_frames:
+                self._log.frames(sent)
+            if whole_second:
+                self._sample(self._log, time_ns, self.last)
+        return sent
+
+    def _close_window(self, time_ns: int) -> None:
+        """Make a step of the estimator and an estimate at the end of a window."""
+        now = self.codec.seconds(time_ns)
+        self.estimator.step(now, self.codec.windows())
+        estimate = self.estimator.estimate(now)
         if self._recent or self.extra_reasons:
             estimate.reasons |= self._recent | self.extra_reasons
             if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
@@ -158,15 +174,6 @@ class Pipeline:
             self.last_known = estimate
         if self._observer:
             self._observer(estimate)
-        sent = self.publisher.status(estimate, time_ns)
-        if whole_second:
-            sent += self.publisher.range(estimate, self.counts(), time_ns)
-        if self._log:
-            if self._log_frames:
-                self._log.frames(sent)
-            if whole_second:
-                self._sample(self._log, time_ns, estimate)
-        return sent
 
     def _count_faults(self) -> None:
         counts = self.counts()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate.cooling_run import ride_run
 from gz_onboard.lab.discover.mixed_model import initial
@@ -15,6 +14,7 @@ from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import all_quantities, first_soc, total
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 PACK, P = VEHICLE.pack, VEHICLE.parameters
@@ -58,7 +58,7 @@ def test_the_first_soc_has_the_reaction_settled(amperes: float) -> None:
 @pytest.mark.parametrize("amperes", [-6.0, 1.2, 2.0, 12.0])
 def test_on_board(amperes: float) -> None:
     """A usual load is believed; of a larger one the sensor may as well be wrong, and the interval says so."""
-    e = Estimator(GROUPS, PACK, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(GROUPS, PACK, VEHICLE.model, VEHICLE.riding)
     for step in range(20):
         t = 0.1 * step
         if step % 10 == 0:

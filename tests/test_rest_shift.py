@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.events import Group
 from gz_onboard.physics.battery import Battery
@@ -23,6 +22,7 @@ from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import OWN, read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 PLAIN = VEHICLE.pack
@@ -118,7 +118,7 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     sd = {}
     for battery in (COLD, PLAIN):
-        estimator = Estimator(groups, battery, VEHICLE.model, VEHICLE.riding)
+        estimator = EventEstimator(groups, battery, VEHICLE.model, VEHICLE.riding)
         estimator.handle((0.9, 0, (0.0,)))
         for time in (1.0, 2.0):
             estimator.handle((time, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
@@ -208,7 +208,7 @@ def test_a_wrong_start_is_left_by_less_where_errors_stay_longer(tmp_path):
     sd = {}
     for name, battery in (("long", read(tmp_path, TIMES)), ("usual", PLAIN)):
         groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-        estimator = Estimator(groups, battery, VEHICLE.model, VEHICLE.riding)
+        estimator = EventEstimator(groups, battery, VEHICLE.model, VEHICLE.riding)
         volts = 14 * battery.ocv(0.6, -10.0)[0]
         for k in range(1, 600):
             estimator.handle((k - 0.1, 0, (-10.0,)))

@@ -41,9 +41,10 @@ class LivePositions:
         """Take in frames, in the order of their times; gives each new position as a row."""
         codec, signals = self._codec, self._signals
         for frame in frames:
-            for time, group, values in codec.decode([frame]):
-                for role, value in zip(codec.groups[group].roles, values, strict=True):
-                    if value is not None:
-                        signals[role].value, signals[role].time = value, time
+            codec.decode([frame])
+            for window in codec.windows():
+                for role, samples in zip(codec.groups[window.group].roles, window.roles, strict=True):
+                    if samples is not None:
+                        signals[role].take(samples)
             if found := self._positions.new(signals, codec.seconds(frame[0]), frame[0]):
                 yield found[1]

@@ -1,4 +1,7 @@
-"""From CAN frames to events, through a cantools database compiled once.
+"""Decode CAN frames and accumulate their signals, through a cantools database compiled once.
+
+A frame costs a check and an addition: its raw values go into sums, which `Codec.windows` scales and hands over about
+twice a second.
 
 Whole frame or nothing: what fails a check is dropped, counted by message and reason, and never becomes a
 number. Nothing here raises on whatever the bus brings.
@@ -12,16 +15,27 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, by_response
+from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, Take, by_response
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.origins import RECENT, Origins
 from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
-from gz_onboard.events import ERR_FLAG, RTR_FLAG, STALE_PERIODS, TRANSMITTED, Event, Frame, Group
+from gz_onboard.events import (
+    ERR_FLAG,
+    RTR_FLAG,
+    SQUARED,
+    STALE_PERIODS,
+    TRANSMITTED,
+    Frame,
+    Group,
+    MessageWindow,
+    RoleWindow,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -56,8 +70,95 @@ _MOST_LEAPS = 100  # are remembered
 CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
 _MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
 
-Handler = Callable[[float, bytes], bool | None]
-"""Takes the time [s] and data of a frame; True if the frame was dropped."""
+Handler = Callable[[int, bytes], bool | None]
+"""Takes the time [ns, on the codec's timeline] and data of a frame; True if the frame was dropped."""
+Drained = tuple[int, int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+"""Frames, time of the last [ns], and of each signal the last raw value, the sum, and the sum of squares."""
+
+
+@dataclass(slots=True)
+class Spill:
+    """Valid samples of one signal from frames in which another signal was missing or not valid; raw values."""
+
+    count: int = 0
+    time: int = -1  # ns
+    value: float = 0.0
+    total: float = 0.0
+    square: float = 0.0
+
+    def add(self, time: int, value: float) -> None:
+        """Take a raw value at `time` [ns]."""
+        self.time, self.value, self.count = time, value, self.count + 1
+        self.total += value
+        self.square += value * value
+
+
+class Accumulator:
+    """Samples of one message since the last window.
+
+    fault: counts (place, reason).
+    """
+
+    def __init__(self, mapped: MappedMessage, group: int, fault: Callable[[str, str], None]) -> None:
+        self.mapped, self.group, self._fault = mapped, group, fault
+        self.drain: Callable[[], Drained]
+        self._spilled = 0  # frames
+        self._spill_time = -1  # ns
+        self._spills = [Spill() for _ in mapped.sources]
+
+    def spill(self, time: int, raw: Sequence[float | None]) -> None:
+        """Take a frame at `time` [ns] in which some raw values are absent or not within their limits."""
+        self._spilled, self._spill_time, mapped = self._spilled + 1, time, self.mapped
+        for spill, source, signal, (low, high), value in zip(
+            self._spills, mapped.sources, mapped.signals, mapped.limits, raw, strict=True
+        ):
+            if value is not None and low <= value <= high:  # False for NaN
+                spill.add(time, value)
+            elif value is not None:
+                absent = mapped.not_available and is_not_available(signal, value)
+                self._fault(f"{source.message}.{source.signal}", NOT_AVAILABLE if absent else RANGE)
+
+    def spill_undecoded(self, time: int, data: bytes) -> bool | None:
+        """Take a frame at `time` [ns] that cantools has to decode; True if it cannot."""
+        values = raw_values(self.mapped.message, data)
+        if values is None:
+            self._fault(self.mapped.message.name, UNDECODABLE)
+            return True
+        raw = [values.get(source.signal) for source in self.mapped.sources]  # absent: another multiplexed branch
+        if any(value is not None for value in raw):
+            self.spill(time, raw)
+        return None
+
+    def window(self) -> MessageWindow | None:
+        """The samples since the last call; None if no frame came."""
+        n, last, values, sums, squares = self.drain()
+        if not n and not self._spilled:
+            return None
+        roles: list[RoleWindow | None] = []
+        square = iter(squares)
+        for i, (source, spill) in enumerate(zip(self.mapped.sources, self._spills, strict=True)):
+            squared = source.role in SQUARED
+            total, raw, time = (sums[i], values[i], last) if n else (0, 0.0, -1)
+            square_total = next(square) if squared and n else 0
+            count, scale, offset = n + spill.count, source.factor, source.offset
+            if spill.count:
+                total, square_total = total + spill.total, square_total + spill.square
+                if spill.time >= time:
+                    time, raw = spill.time, spill.value
+            if not count:
+                roles.append(None)
+                continue
+            mean = total / count
+            mean_square = scale * scale * square_total / count + offset * (2 * scale * mean + offset)
+            roles.append(
+                RoleWindow(
+                    time * 1e-9, raw * scale + offset, count, mean * scale + offset, mean_square if squared else None
+                )
+            )
+        time, count = max(last if n else -1, self._spill_time if self._spilled else -1), n + self._spilled
+        if self._spilled:
+            self._spilled, self._spills = 0, [Spill() for _ in self._spills]
+        return MessageWindow(self.group, time * 1e-9, count, tuple(roles))
 
 
 class Codec:
@@ -78,7 +179,7 @@ class Codec:
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
         # Likewise, below zero, of the last good answer to a request: -1 for the first request, and so on.
         self.wrong_lengths: dict[str, int] = {}  # message of an answer -> bytes of the last that has another length
-        self._events: list[Event] = []
+        self._accumulators: list[Accumulator] = []
         self._origin_ns: int | None = None
         self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
         self._last_ns = -(1 << 80)  # before any frame: far from every time
@@ -86,7 +187,7 @@ class Codec:
         self._suspect_ns = 0  # the time of the last suspect
         self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion
         self.origins = Origins(mapping)
-        self._own_times: dict[str, float] = {}  # s, of the last frame of messages that are heard elsewhere as well
+        self._own_times: dict[str, int] = {}  # ns, of the last frame of messages that are heard elsewhere as well
         self._handlers: dict[int, dict[int, Handler]] = {}  # by channel and identifier, of what was heard
         self._channel, self._room = -1, _MOST_IDENTIFIERS  # of the last frame; further handlers to keep
         self._decoders: dict[str, Handler] = {}
@@ -101,8 +202,8 @@ class Codec:
 
     # --- frames ---------------------------------------------------------------------------------------------
 
-    def decode(self, frames: Iterable[Frame]) -> list[Event]:
-        """The events of `frames`, in their order; their times are seconds since the first frame ever decoded."""
+    def decode(self, frames: Iterable[Frame]) -> None:
+        """Decode `frames` and add their values to the window. Times are since the first frame ever decoded."""
         latest, heard = self.latest, self._channel
         handlers = self._handlers.setdefault(heard & ~TRANSMITTED, {})
         origin, last = self._origin_ns, self._last_ns
@@ -125,14 +226,15 @@ class Codec:
                 handler = handlers[identifier]
             except KeyError:
                 handler = self._first_heard(channel & ~TRANSMITTED, identifier)
-            if handler((time_ns - origin) * 1e-9, data):  # type: ignore[operator]
+            if handler(time_ns - origin, data):  # type: ignore[operator]
                 continue
             latest[identifier] = (time_ns, data)
         self._last_ns, self._channel = last, heard
         self.received += count
-        events = self._events[:]
-        self._events.clear()
-        return events
+
+    def windows(self) -> list[MessageWindow]:
+        """The values of each message since the last call, of those that came."""
+        return [window for accumulator in self._accumulators if (window := accumulator.window())]
 
     @property
     def started(self) -> bool:
@@ -141,7 +243,7 @@ class Codec:
 
     @property
     def passed(self) -> float:
-        """The time of the last frame on the timeline of the events [s]."""
+        """The time of the last frame on the timeline [s]."""
         return self.seconds(self._last_ns)
 
     def odd(self, frames: Sequence[Frame]) -> None:
@@ -151,7 +253,7 @@ class Codec:
             self._fault("", TIME)
 
     def seconds(self, time_ns: int) -> float:
-        """`time_ns` on the timeline of the events."""
+        """`time_ns` on the timeline [s]."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
 
     def time_ns(self, seconds: float) -> int:
@@ -226,7 +328,7 @@ class Codec:
         if message.name not in self.origins.recent:
             return decode
 
-        def handler(time: float, data: bytes) -> bool | None:
+        def handler(time: int, data: bytes) -> bool | None:
             self.origins.own(message.name, data)
             self._own_times[message.name] = time
             return decode(time, data)
@@ -252,14 +354,14 @@ class Codec:
                 handlers[own] = self._own(message, heard, own)
                 time_ns, data = self.latest.get(own, (0, b""))
                 recent.append(data)
-                self._own_times[name] = self.seconds(time_ns)
-        stale = max(SILENT, STALE_PERIODS * self.mapping.periods.get(name, 0.0))
+                self._own_times[name] = time_ns - (self._origin_ns or 0)
+        stale = 1e9 * max(SILENT, STALE_PERIODS * self.mapping.periods.get(name, 0.0))  # ns
 
-        def contradicted(_time: float, _data: bytes) -> bool:
+        def contradicted(_time: int, _data: bytes) -> bool:
             self._fault(name, CONFLICT)
             return True
 
-        def handler(time: float, data: bytes) -> bool:
+        def handler(time: int, data: bytes) -> bool:
             silent = time - self._own_times.get(name, time) > stale
             if silent and origins.take_over(message, channel, identifier):
                 for handlers in self._handlers.values():
@@ -275,22 +377,22 @@ class Codec:
 
         return handler
 
-    def _count_copy(self, _time: float, _data: bytes) -> bool:
+    def _count_copy(self, _time: int, _data: bytes) -> bool:
         self.copies += 1
         return True
 
-    def _count_error(self, _time: float, _data: bytes) -> bool:
+    def _count_error(self, _time: int, _data: bytes) -> bool:
         self.error_frames += 1
         return True
 
-    def _count_others(self, _time: float, _data: bytes) -> bool:
+    def _count_others(self, _time: int, _data: bytes) -> bool:
         self.unknown_others += 1
         return True
 
     def _count_unknown(self, identifier: int) -> Handler:
         unknown = self.unknown
 
-        def handler(_time: float, _data: bytes) -> bool:
+        def handler(_time: int, _data: bytes) -> bool:
             unknown[identifier] = unknown.get(identifier, 0) + 1
             return True
 
@@ -329,19 +431,21 @@ class Codec:
         handlers: dict[int, Handler] = dict.fromkeys(asked, lambda _time, _data: True)
         for response, those in by_response(requests).items():
             takers = [self._answer(-1 - requests.index(one), by_message.get(one.name, [])) for one in those]
-            handlers[response] = Answers(those, takers, self._fault).take
+            answers = Answers(those, takers, self._fault)
+            handlers[response] = lambda time, data, answers=answers: answers.take(time * 1e-9, data)  # type: ignore[misc]
         return handlers
 
-    def _answer(self, key: int, sources: list[Source]) -> Handler:
+    def _answer(self, key: int, sources: list[Source]) -> Take:
         """What takes the data of the answer whose `latest` is that of `key`."""
         message = self.mapping.requests[-1 - key].message
         decode = self._handler(message, sources, not_available=False)  # all ones are a value: what limits are for
 
-        def take(time: float, data: bytes) -> None:
+        def take(seconds: float, data: bytes) -> None:
+            time = round(seconds * 1e9)
             if len(data) != message.length:
                 self.wrong_lengths[message.name] = len(data)
             if not decode(time, data) and self._origin_ns is not None:
-                self.latest[key] = (self._origin_ns + round(time * 1e9), data)
+                self.latest[key] = (self._origin_ns + time, data)
 
         return take
 
@@ -354,60 +458,26 @@ class Codec:
         mapped = MappedMessage(message, sources, protection, mapping.periods.get(name), codes)
         group = len(self.groups)
         self.groups.append(Group(name, tuple(source.role for source in sources), mapped.period))
+        accumulator = Accumulator(mapped, group, self._fault)
+        self._accumulators.append(accumulator)
         scope: dict[str, Any] = {"LENGTH": LENGTH, "CRC": CRC, "COUNTER": COUNTER}
         exec(compile(mapped.source(), f"<layout of {name}>", "exec"), scope)
-        partly = self._partly(mapped, group)
-        through = partly if mapped.plain else self._through_cantools(mapped, partly)
+        spill = accumulator.spill if mapped.plain else accumulator.spill_undecoded
         constant, tables = sae_j1850_tables(message.length - 1) if protection.crc else (0, [])
-        handler: Handler = scope["make"](self, group, through, *([constant, *tables] if protection.crc else []))
+        handler: Handler
+        handler, accumulator.drain = scope["make"](self, spill, *([constant, *tables] if protection.crc else []))
         return handler
 
     def _check_length_only(self, message: Message) -> Handler:
         name, length = message.name, message.length
 
-        def handler(_time: float, data: bytes) -> bool | None:
+        def handler(_time: int, data: bytes) -> bool | None:
             if len(data) == length:
                 return None
             self._fault(name, LENGTH)
             return True
 
         return handler
-
-    def _partly(self, mapped: MappedMessage, group: int) -> Callable[[float, Sequence[float | None]], None]:
-        """What makes the event of a frame of which some raw values are absent or not within their limits."""
-
-        def take(time: float, raw: Sequence[float | None]) -> None:
-            values: list[float | None] = []
-            for source, signal, (low, high), value in zip(
-                mapped.sources, mapped.signals, mapped.limits, raw, strict=True
-            ):
-                if value is not None and low <= value <= high:  # False for NaN
-                    values.append(value * source.factor + source.offset)
-                    continue
-                values.append(None)
-                if value is not None:
-                    absent = mapped.not_available and is_not_available(signal, value)
-                    self._fault(f"{source.message}.{source.signal}", NOT_AVAILABLE if absent else RANGE)
-            self._events.append((time, group, tuple(values)))
-
-        return take
-
-    def _through_cantools(
-        self, mapped: MappedMessage, take: Callable[[float, Sequence[float | None]], None]
-    ) -> Callable[[float, bytes], bool | None]:
-        """What decodes and takes the data of a frame that cantools has to decode."""
-
-        def decode(time: float, data: bytes) -> bool | None:
-            values = raw_values(mapped.message, data)
-            if values is None:
-                self._fault(mapped.message.name, UNDECODABLE)
-                return True
-            raw = [values.get(source.signal) for source in mapped.sources]  # absent: another multiplexed branch
-            if any(value is not None for value in raw):
-                take(time, raw)
-            return None
-
-        return decode
 
     def _jumped(self, message: str, lost: int) -> None:
         """Count the `lost` frames that a message's counter shows as missing."""

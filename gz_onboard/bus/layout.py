@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 
 from gz_onboard.bus.dbc import FARTHEST
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
-from gz_onboard.events import EFF_FLAG, PLAUSIBLE, PLAUSIBLE_OF, ROLES, STALE_PERIODS
+from gz_onboard.events import EFF_FLAG, PLAUSIBLE, PLAUSIBLE_OF, ROLES, SQUARED, STALE_PERIODS
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -197,54 +197,74 @@ class MappedMessage:
         return not any(s.is_multiplexer or s.multiplexer_ids is not None or s.conversion.is_float for s in self.signals)
 
     def source(self) -> str:
-        """Python source of ``make(codec, group, through, crc constant, *crc tables)``, which returns the handler.
+        """Python source of ``make(codec, spill, constant, *tables)``, which returns ``(handler, drain)``.
 
-        ``through`` takes what is not plain: the raw values if some are beyond their limits, or (if not `plain`) the
-        data. The names LENGTH, CRC and COUNTER are the codec's, of why a frame is dropped.
+        ``handler(time, data)`` takes a frame at `time` [ns] and returns True if the frame is dropped. Sums are of raw
+        integers, so that they are exact; they are scaled once a window. ``drain()`` returns (frames, time of the last,
+        raw last values, raw sums, raw sums of squares) and starts a new window. ``spill(time, raw values)`` takes
+        frames with a value beyond its limits, and ``spill(time, data)`` those that are not `plain`. constant, tables:
+        of the CRC. The names LENGTH, CRC and COUNTER are the codec's reasons for dropping a frame.
         """
         n, protection = self.message.length, self.protection
         crc = ["constant", *(f"t{i}" for i in range(n - 1))] if protection.crc else []
         counter = self.message.get_signal_by_name(protection.counter) if protection.counter else None
-        needed = [*(self.signals if self.plain else []), *([counter] if counter else [])]
-        setup, body, raw = _unpacking(needed, n)
+        signals = self.signals if self.plain else []
+        setup, body, raw = _unpacking([*signals, *([counter] if counter else [])], n)
         if protection.crc:
             sum_ = " ^ ".join([crc[0], *(f"{table}[d[{i}]]" for i, table in enumerate(crc[1:]))])
             body = [f"if {sum_} != d[{n - 1}]:", "    fault(name, CRC)", "    return True", *body]
+        state = ["following", "seen"] if counter else []
         if counter:
             low, high = raw_range(counter, self.not_available)
-            setup += [f"    following, seen = {low}, -1e9"]
-            pause = STALE_PERIODS * self.period if self.period else PAUSE
+            setup += [f"    following, seen = {low}, -1 << 80"]
+            pause = round((STALE_PERIODS * self.period if self.period else PAUSE) * 1e9)
             body += _follow_counter(raw.pop(), int(low), int(high), pause)
-        body += self._event(raw) if self.plain else ["return through(t, d)"]
+        numbers = range(len(signals))
+        squared = [i for i in numbers if self.sources[i].role in SQUARED]
+        last, sums = ([f"{name}{i}" for i in numbers] for name in "vs")
+        squares = [f"q{i}" for i in squared]
+        if signals:
+            state += ["n", "last", *last, *sums, *squares]
+            body += self._accumulate(raw, squared)
+        else:
+            body.append("return spill(t, d)")
+        zero = " = ".join(["n", *sums, *squares, "0"])
+        returned = ", ".join(f"({''.join(f'{x}, ' for x in those)})" for those in (last, sums, squares))
         lines = [
-            f"def make({', '.join(['codec', 'group', 'through', *crc])}):",
+            f"def make({', '.join(['codec', 'spill', *crc])}):",
             f"    name = {self.message.name!r}",
-            "    fault, append = codec._fault, codec._events.append",
+            "    fault = codec._fault",
+            f"    {' = '.join(['n', 'last', *last, *sums, *squares, '0'])}",
             *setup,
             "    def handler(t, d):",
-            *(["        nonlocal following, seen"] if counter else []),
+            *([f"        nonlocal {', '.join(state)}"] if state else []),
             f"        if len(d) != {n}:",
             "            fault(name, LENGTH)",
             "            return True",
             *(f"        {line}" for line in body),
+            "    def drain():",
+            f"        nonlocal {', '.join(['n', *sums, *squares])}",
+            f"        window = n, last, {returned}",
+            f"        {zero}",
+            "        return window",
+            "    return handler, drain",
         ]
-        return "\n".join([*lines, "    return handler", ""])
+        return "\n".join([*lines, ""])
 
-    def _event(self, raw: list[str]) -> list[str]:
-        """Lines that append the event of a frame whose raw values are these expressions, if they are real."""
-        names = [expression if expression.isidentifier() else f"r{i}" for i, expression in enumerate(raw)]
-        lines = [f"{name} = {expression}" for name, expression in zip(names, raw, strict=True) if name != expression]
+    def _accumulate(self, raw: list[str], squared: list[int]) -> list[str]:
+        """Lines that add the raw values given by these expressions to the sums, if they are within their limits."""
+        names = [f"r{i}" for i in range(len(raw))]
         checks = [_check(*arguments) for arguments in zip(names, self.signals, self.limits, strict=True)]
-        values = [
-            f"{name} * {source.factor!r}" + (f" + {source.offset!r}" if source.offset else "")
-            for name, source in zip(names, self.sources, strict=True)
-        ]
         return [
-            *lines,
+            *(f"{name} = {expression}" for name, expression in zip(names, raw, strict=True)),
             f"if {' and '.join(check for check in checks if check) or 'True'}:",
-            f"    append((t, group, ({', '.join(values)},)))",
+            "    n += 1",
+            "    last = t",
+            *(f"    v{i} = r{i}" for i in range(len(raw))),
+            *(f"    s{i} += r{i}" for i in range(len(raw))),
+            *(f"    q{i} += r{i} * r{i}" for i in squared),
             "else:",
-            f"    through(t, ({', '.join(names)},))",
+            f"    spill(t, ({', '.join(names)},))",
         ]
 
 
@@ -264,7 +284,7 @@ def _unpacking(signals: list[Signal], length: int) -> tuple[list[str], list[str]
 def _follow_counter(raw: str, low: int, high: int, pause: float) -> list[str]:
     """Lines that check a counter from `low` to `high`.
 
-    As AUTOSAR's E2E: a repeated or far-off counter is wrong, a small step shows lost frames; after a pause [s] any
+    As AUTOSAR's E2E: a repeated or far-off counter is wrong, a small step shows lost frames; after a pause [ns] any
     value is taken.
     """
     modulo = high - low + 1
@@ -275,7 +295,7 @@ def _follow_counter(raw: str, low: int, high: int, pause: float) -> list[str]:
         f"    if not {low} <= c <= {high}:",
         "        fault(name, COUNTER)",
         "        return True",
-        f"    if t - seen < {pause!r}:",
+        f"    if t - seen < {pause}:",
         f"        lost = (c - following) % {modulo}",
         f"        {step}",
         f"        if lost >= {modulo // 2}:",

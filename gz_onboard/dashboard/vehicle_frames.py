@@ -67,14 +67,15 @@ class VehicleFrames:
 
     def take(self, frame: Frame, now: float) -> None:
         """Take in a frame that came at `now`; one that is not of these, or fails a check, is left out."""
-        for _, number, values in self._codec.decode([frame]):
-            group = self._codec.groups[number]
+        self._codec.decode([frame])
+        for window in self._codec.windows():
+            group = self._codec.groups[window.group]
             self._witnessed += group.message == self._witness
-            for role, value in zip(group.roles, values, strict=True):
-                if value is None or not self._believed:
+            for role, samples in zip(group.roles, window.roles, strict=True):
+                if samples is None or not self._believed:
                     continue
-                if role != ODOMETER or self._day.take(value, frame[0], now):
-                    self._last[role] = value, now
+                if role != ODOMETER or self._day.take(samples.value, frame[0], now):
+                    self._last[role] = samples.value, now
 
     @property
     def _believed(self) -> bool:

@@ -1,6 +1,6 @@
-"""Events in, estimates out: what is done in which order at each step, and what of it is reported and saved.
+"""Windows in, estimates out: the order of one step, and what of it is reported and saved.
 
-No I/O and no clock: time arrives with the events, so the same events give the same estimates, to the last bit.
+No I/O and no clock: time arrives with the windows, so the same windows give the same estimates, to the last bit.
 All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
 check the sensors (`redundancy`), move on the road (`road`), choose the pack's voltage and current (`sources`) and the
 temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
@@ -25,24 +25,19 @@ from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
 from gz_onboard.estimator.route_ahead import RoadAhead
-from gz_onboard.estimator.signals import DEFAULT_STALE, SelfReported, Signals
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
-from gz_onboard.estimator.timing import COARSE, SLOW_GAP, SLOWEST, MessageTiming
+from gz_onboard.estimator.timing import COARSE, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.estimator.weakest import Weakest
-from gz_onboard.events import NO_PACK, STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
+from gz_onboard.events import NO_PACK, STALE_PERIODS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
-PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
-SHOWN = "bms_state_of_charge"
-STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
-PACE_JITTER = 0.05  # s: so near its time a step is left to that message: speed and current of a step are of one time
-SHORTEST_STEP = 0.02  # s: what comes sooner belongs to the last step
 SILENT_AFTER = 2.0  # s without a step: what was measured is no longer reported
 STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be expected soon
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
@@ -67,10 +62,10 @@ class Estimator:
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
         self.road, self.forecaster = RoadState(), Forecaster(model, battery, riding)
+        stale = [(role, group.period) for group in groups for role in group.roles]
         self.signals = Signals(
-            (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
-            for group in groups
-            for role in group.roles
+            ((role, STALE_PERIODS * period if period else DEFAULT_STALE) for role, period in stale),
+            battery.window.of_cells,
         )
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
@@ -79,19 +74,10 @@ class Estimator:
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         self._timing = MessageTiming(groups, self._slots)
-        self._last_seen, self._gaps = self._timing.last, self._timing.gaps
-        self._pace = next(iter(_carrying(PACE, groups)), -1)
         self._speeds = _carrying(SpeedCheck.ROLES, groups)[:1]
-        # Every sample of accel_z is looked at, but only for a model that reads the vibration.
-        self._vibration = VibrationMonitor() if "vibration" in model.reads else None
-        self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._vibration else -1
-        self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
-        own = [[(at, s) for at, s in enumerate(slots) if isinstance(s, SelfReported)] for slots in self._slots]
-        self._inspected = {i: found for i, found in enumerate(own) if found or i == self._shaken}
-        self.signals.self_reported[SHOWN].zero = battery.window.of_cells(0.0)
+        self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
-        self._deadline = float("-inf")
         self._odometer: float | None = None  # m, at the last step
         self._odometer_step = 0.0  # m, the largest of its counts; 0: it has not counted yet
         self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
@@ -120,59 +106,30 @@ class Estimator:
         """`rider` rides from now on."""
         self.forecaster.ridden_by(rider)
 
-    # --- events -----------------------------------------------------------------------------------------------
+    # --- one step ---------------------------------------------------------------------------------------------
 
-    def handle(self, event: Event) -> None:
-        """Take in one event; the pace-setting message (pack voltage and current) also makes a step."""
-        time, group, values = event
-        gap = time - self._last_seen[group]
-        self._last_seen[group] = time
-        if gap > SLOW_GAP or self._gaps[group]:
-            self._timing.watch(group, gap)
-        if group in self._inspected:
-            values = self._inspect(time, group, values)
-        for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
-            if value is not None:
-                signal.value = value
-                signal.time = time
-                signal.total += value
-                signal.count += 1
-        if group == self._pace or time >= self._deadline:
-            if group != self._pace and self._await_pace(time):
-                return
-            self._step(time)
+    def step(self, now: float, windows: Sequence[MessageWindow]) -> None:
+        """Take the `windows` of messages that end at `now` [s] and go on by them; without any nothing happens."""
+        if not windows:
+            return
+        for window in windows:
+            self._timing.take(window)
+            for signal, samples in zip(self._slots[window.group], window.roles, strict=True):
+                if samples is not None:
+                    signal.take(samples)
+        self._advance(now)
+        self.signals.next_window()
 
-    def _inspect(self, time: float, group: int, values: tuple[float | None, ...]) -> tuple[float | None, ...]:
-        """`values` without self-reported ones that jump; the vehicle's state of charge becomes that of the cells."""
-        if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
-            self._vibration.update(time, accel_z)
-        plausible = list(values)
-        for i, signal in self._inspected[group]:
-            value = values[i]
-            if value is not None:
-                value = self.battery.window.of_cells(value) if signal.role == SHOWN else value
-                plausible[i] = value if signal.accepts(value, time) else None
-        return tuple(plausible)
-
-    def _await_pace(self, time: float) -> bool:
-        """Whether the message that sets the pace is about to come: the first, or the next by its period."""
-        if self._time is None and self._deadline < 0:
-            self._deadline = time + STEP_AT_LEAST
-            return True
-        if self._pace < 0 or abs(time - self._last_seen[self._pace] - self._timing.periods[self._pace]) >= PACE_JITTER:
-            return False
-        self._deadline = time + PACE_JITTER
-        return True
-
-    def _step(self, now: float) -> None:
+    def _advance(self, now: float) -> None:
         dt = self._elapsed(now)
-        if dt is None or (dt < SHORTEST_STEP and self._time is not None):
+        if dt is None:
             return
         self._time = now
-        self._deadline = now + STEP_AT_LEAST
         signals, road = self.signals, self.road
         elapsed = min(dt, self._timing.pause)
         self.gap_time += dt - elapsed
+        if self._vibration:
+            self._vibration.step(now, signals.accel_z)
         self.redundancy.step(StepInputs(now, dt, elapsed, signals, road.speed))
         road.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
@@ -183,7 +140,6 @@ class Estimator:
         self.weakest.step(now, self._reading, temperature, self.soc)
         self._follow_activity(now, dt)
         self._ride(now, dt)
-        signals.next_step()
         if self.filter is None:
             self._outlook.outdate()
         elif self._outlook.due(now):
@@ -199,13 +155,13 @@ class Estimator:
         moved = 0.0 if self._odometer is None else odometer.value - self._odometer
         if dt > LEAP and self._odometer_step and speed > MOVING:
             self._clock_leap = self._clock_leap or now
-            came = odometer.time >= self._clock_leap - STEP_AT_LEAST
+            came = odometer.time >= self._clock_leap - WINDOW
             if not came and now - self._clock_leap < ODOMETER_WITHIN:
                 return None
             self.road.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
             least = min(speed, self.road.speed or 0.0) * dt / 2
             if came and 0 <= moved + self._odometer_step < least:
-                dt, moved = max(now - self._clock_leap, SHORTEST_STEP), 0.0
+                dt, moved = max(now - self._clock_leap, WINDOW), 0.0
         elif 0 < moved < UNLEARNED:
             self._odometer_step = max(self._odometer_step, moved)
         self._clock_leap, self._odometer = None, odometer.last

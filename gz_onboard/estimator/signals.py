@@ -1,13 +1,13 @@
-"""The last value of each role, and its mean since the last step of the estimator."""
+"""The last value of each role, and its mean over the last window."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import inf
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import HOUR
-from gz_onboard.events import ROLES
+from gz_onboard.events import ROLES, RoleWindow
 
 STEP_LIMITS = {  # most rise and fall from one message to the next, and more per second in between
     "bms_state_of_charge": (0.15, 0.15, 6 / HOUR),
@@ -21,15 +21,19 @@ FIX_2D, FIX_3D = 2, 3  # of `gps_fix`: a position, an altitude
 class Signal:
     """One role."""
 
-    __slots__ = ("count", "stale_after", "time", "total", "trusted", "value")
+    __slots__ = ("_mean", "count", "mean_square", "stale_after", "time", "trusted", "value")
 
     def __init__(self) -> None:
-        self.value = 0.0
-        self.time = float("-inf")  # s, of the last value
-        self.total = 0.0
-        self.count = 0
+        self.value = self._mean = 0.0
+        self.time = -inf  # s, of the last value
+        self.count = 0  # samples in the last window
+        self.mean_square: float | None = None  # of the last window, of `SQUARED` roles
         self.stale_after = 0.0  # s; 0: the vehicle has no such signal
         self.trusted = True  # False: other sensors contradict it, and it is taken as missing
+
+    def take(self, window: RoleWindow) -> None:
+        """Take the samples of a window."""
+        self.time, self.value, self.count, self._mean, self.mean_square = window
 
     def fresh(self, now: float) -> bool:
         """Whether it has a value that is not stale at `now` [s] and is trusted."""
@@ -45,16 +49,14 @@ class Signal:
         return self.value if self.time > -inf else None
 
     def mean(self, now: float) -> float | None:
-        """Its mean since the last step; if nothing came, its last value; None if that is stale or not trusted."""
-        if not self.trusted or now - self.time > self.stale_after:  # `reported`, without the call
-            return None
-        return self.total / self.count if self.count else self.value
+        """Its mean over the last window; if nothing came, its last value; None if that is stale or not trusted."""
+        return self.reported(now) if self.trusted else None
 
     def reported(self, now: float) -> float | None:
         """What `mean` gives, trusted or not."""
         if now - self.time > self.stale_after:
             return None
-        return self.total / self.count if self.count else self.value
+        return self._mean if self.count else self.value
 
 
 class SelfReported(Signal):
@@ -63,14 +65,21 @@ class SelfReported(Signal):
     An ECU may send 0, or anything, until it has read its memory after waking, and while it falls asleep.
     """
 
-    __slots__ = ("accepted", "rejected", "restarted", "role", "zero")
+    __slots__ = ("accepted", "convert", "rejected", "restarted", "role", "zero")
 
-    def __init__(self, role: str) -> None:
+    def __init__(self, role: str, convert: Callable[[float], float] = float) -> None:
         super().__init__()
-        self.role, self.zero = role, 0.0  # a placeholder, unless the value was near it before
+        self.role, self.convert = role, convert
+        self.zero = convert(0.0)  # a placeholder, unless the value was near it before
         self.accepted: tuple[float, float] | None = None  # value and its time [s]
         self.rejected: tuple[float, float, float] | None = None  # value, its time, since when [s]
         self.restarted = False  # the last value jumped, and the jump has persisted
+
+    def take(self, window: RoleWindow) -> None:
+        """Take the last value of a window, if it is plausible."""
+        value = self.convert(window.value)
+        if self.accepts(value, window.time):
+            self.time, self.value, self.count, self._mean = window.time, value, 1, value
 
     def accepts(self, value: float, now: float) -> bool:
         """Whether the `value` that came at `now` [s] is plausible."""
@@ -95,8 +104,12 @@ class SelfReported(Signal):
 class Signals:
     """All roles as attributes by name; those that the vehicle does not have are always stale."""
 
-    def __init__(self, stale_after: Iterable[tuple[str, float]]) -> None:
-        self.self_reported = {role: SelfReported(role) for role in STEP_LIMITS}
+    def __init__(self, stale_after: Iterable[tuple[str, float]], of_cells: Callable[[float], float] = float) -> None:
+        """stale_after: seconds by role. of_cells: from the charge that the vehicle shows to that of its cells."""
+        self.self_reported = {
+            "bms_state_of_charge": SelfReported("bms_state_of_charge", of_cells),
+            "odometer": SelfReported("odometer"),
+        }
         self._all = {role: self.self_reported.get(role) or Signal() for role in ROLES}
         for role, seconds in stale_after:
             self._all[role].stale_after = seconds
@@ -125,8 +138,7 @@ class Signals:
         """Whether the GPS reports a fix worse than `least` (`FIX_2D`, `FIX_3D`), or one that is not of the vehicle."""
         return self.carried or (self.gps_fix.fresh(now) and self.gps_fix.value < least)
 
-    def next_step(self) -> None:
-        """Start new means."""
+    def next_window(self) -> None:
+        """Forget the samples of the window before."""
         for signal in self._mapped:
-            signal.total = 0.0
             signal.count = 0

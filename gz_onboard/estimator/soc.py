@@ -248,8 +248,7 @@ class StateOfCharge:
     def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
-        last = self.current if self.current is not None else current
-        mean = ((last or 0.0) + (current or 0.0)) / 2
+        mean = current or 0.0  # over the window
         charge = HOUR * battery.pack_capacity(temperature)
         sampled, pause = self._timing.sampled, self._timing.pause
         # Beyond, most that flows is not seen.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import inf
 
 from gz_onboard.estimator.signals import Signal
-from gz_onboard.events import Group
+from gz_onboard.events import Group, MessageWindow
 
 SLOW_GAP = 0.4  # s: messages with longer gaps are watched for their real period; no usual one is near that
 COARSE = 0.55  # s: pack current and voltage that come less often are too coarse for a comparison second by second
@@ -21,15 +21,15 @@ INTEGRATED = {"pack_current", "pack_voltage"}
 
 
 class MessageTiming:
-    """Learns the real periods of messages. `last` and `gaps` are public for the estimator's hot path only.
+    """Learns the real periods of messages.
 
     sampled: the longest real period of pack current and voltage [s], 0 where they are not slow. pause: a gap that is
     longer [s] is a pause, in which charge is not counted.
     """
 
     def __init__(self, groups: Sequence[Group], slots: Sequence[Sequence[Signal]]) -> None:
-        self.last = [-inf] * len(groups)  # s, of each group's last message
-        self.gaps = [0.0] * len(groups)  # s, between the two before that; 0 where they are short
+        self._last = [-inf] * len(groups)  # s, of each group's last message
+        self._gaps = [0.0] * len(groups)  # s, between the two before that; 0 where they are short
         self.periods = [group.period or 0.0 for group in groups]  # s, where slow: declared, then as they really are
         self._slots = slots
         self._fast = [0] * len(groups)  # short gaps in a row since the last long one
@@ -38,18 +38,20 @@ class MessageTiming:
         self._integrated = [i for i, group in enumerate(groups) if INTEGRATED & set(group.roles)]
         self._summarise()
 
-    def watch(self, group: int, gap: float) -> None:
-        """Learn the real period of a message that comes with long gaps [s]: two alike are no coincidence."""
-        before = self.gaps[group]
+    def take(self, window: MessageWindow) -> None:
+        """Learn the real period of a message that comes with long gaps: two alike are no coincidence."""
+        group, count = window.group, window.frames
+        gap, before = (window.time - self._last[group]) / count, self._gaps[group]
+        self._last[group] = window.time
         if gap <= SLOW_GAP:
-            self._fast[group] += 1
+            if not before:
+                return
+            self._fast[group] += count
             if self._fast[group] < FAST_COUNT:  # it may come in bursts
                 return
-            self.gaps[group], self.periods[group], stale = 0.0, 0.0, self._stale[group]
+            self._gaps[group], self.periods[group], stale = 0.0, 0.0, self._stale[group]
         else:
-            for signal in self._slots[group]:  # no mean with what came before the gap
-                signal.total, signal.count = 0.0, 0
-            self.gaps[group], self._fast[group] = gap, 0
+            self._gaps[group], self._fast[group] = gap, 0
             if not before or not ALIKE[0] < gap / before < ALIKE[1] or gap > LONGEST_STALE:
                 return
             self.periods[group] = max(gap, before)

@@ -1,48 +1,43 @@
-"""How rough the road is, from samples as a bus brings them: some late, some lost, some stuck."""
+"""How rough the road is, from the spread of the vertical acceleration within a window."""
 
 from __future__ import annotations
 
-from gz_onboard.physics.vibration import FAST, SLOW, Vibration
+from math import exp, inf, sqrt
+
+from gz_onboard.estimator.signals import Signal
+from gz_onboard.events import WINDOW
+from gz_onboard.physics.vibration import FAST, SLOW
 
 SETTLED = 3 * SLOW  # s of samples before there is a value: 97 % of it is there
-LONGEST_INTERVAL = 0.034  # s between samples in the mean: those further apart do not show what a road does to a wheel
-STUCK = 1.0  # s of one and the same value: no accelerometer, not even at rest, gives that
+STILL = 1e-6  # (m/s²)²: less is a stuck sensor's, and rounding
+FEWEST = WINDOW / 0.034  # samples in a window: a slower sensor does not show what a road does to a wheel
 
 
 class VibrationMonitor:
-    """`Vibration` of samples of accel_z. None while it would be a wrong number: see `value`."""
+    """The RMS [m/s²] of the vertical acceleration that is faster than `FAST`, over about `SLOW`.
 
-    __slots__ = ("_before", "_count", "_same", "_since", "_time", "_vibration")
+    Too few samples, or a sensor that shows one and the same value, begin it anew: no accelerometer is that still.
+    """
 
     def __init__(self) -> None:
-        self._restart(float("-inf"), float("nan"))
+        self._since = self._time = -inf  # s: the first window and the last
+        self._square = 0.0  # (m/s²)²
 
-    def _restart(self, time: float, accel_z: float) -> None:
-        self._vibration = Vibration()
-        self._vibration.update(0.0, accel_z)
-        self._since = self._time = self._same = time  # s: the first sample, the last, the first of the last's value
-        self._before = accel_z
-        self._count = 0  # samples after the first
-
-    def update(self, time: float, accel_z: float) -> None:
-        """A sample [m/s²] at `time` [s]. After a gap, time that goes back or a stuck sensor all begins anew."""
-        dt = time - self._time
-        if dt == 0:
+    def step(self, now: float, accel_z: Signal) -> None:
+        """Take the samples of the window that ends at `now` [s]."""
+        n, mean = accel_z.count, accel_z.mean(now)
+        if n < FEWEST or mean is None or accel_z.mean_square is None:
             return
-        if not 0 < dt <= FAST or time - self._same > STUCK:
-            same = self._same if accel_z == self._before else time
-            self._restart(time, accel_z)
-            self._same = same if dt > 0 else time
-            return
-        if accel_z != self._before:
-            self._before, self._same = accel_z, time
-        self._time = time
-        self._count += 1
-        self._vibration.update(dt, accel_z)
+        square = (accel_z.mean_square - mean * mean) * n / (n - 1)
+        dt = now - self._time
+        if square < STILL or dt > 2 * WINDOW:
+            self._since, self._square = now, max(square, 0.0)
+        keep = exp(-WINDOW / n / FAST)  # of white shaking, `Vibration` shows this share
+        self._square += (1 - exp(-min(dt, WINDOW) / SLOW)) * (square * keep * keep * 2 / (1 + keep) - self._square)
+        self._time = now
 
     def value(self, now: float) -> float | None:
         """[m/s²] at `now` [s]; None while samples are missing, too few, or only just come again."""
-        elapsed = self._time - self._since
-        if now - self._time > FAST or elapsed < SETTLED or self._count * LONGEST_INTERVAL < elapsed:
+        if now - self._time > 2 * WINDOW or self._time - self._since < SETTLED:
             return None
-        return self._vibration.value
+        return sqrt(self._square)

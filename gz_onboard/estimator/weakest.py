@@ -183,7 +183,7 @@ class Weakest:
         signal = self._signal
         if soc.another_pack:
             self._begin_anew()
-        if not self.mapped or self._signals.pack_voltage.time != now:
+        if not self.mapped or not self._signals.pack_voltage.count:
             return
         new, self._then = signal.time > self._then, now  # between two of the pack's voltages
         if reading.voltage is None or reading.current is None or soc.filter is None:

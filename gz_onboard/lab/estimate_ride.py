@@ -30,7 +30,6 @@ from gz_onboard.recording.timeline import stray
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-TICK_S = TICK_NS * 1e-9
 IDENTIFIED_WITHIN = 60.0  # s from the first frame
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile

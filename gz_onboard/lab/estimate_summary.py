@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated, cast
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR, WH, WH_PER_KM
-from gz_onboard.events import Estimate, Reason, State
-from gz_onboard.lab.estimate_ride import TICK_S, Ridden
+from gz_onboard.events import WINDOW, Estimate, Reason, State
+from gz_onboard.lab.estimate_ride import Ridden
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.why import Why, why_of
 from gz_onboard.offline.results import leap_text, times
@@ -171,9 +171,9 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         saved_state_age_s=went_on.age if went_on else None,
         innovation_rms_v=tally.innovation_rms,
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
-        states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
-        reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
-        distrusted={role: round(ticks * TICK_S, 1) for role, ticks in sorted(tally.distrusted.items())},
+        states={state.name: round(states[state.name] * WINDOW, 1) for state in State if states[state.name]},
+        reasons={name: round(ticks * WINDOW, 1) for name, ticks in sorted(reasons.items())},
+        distrusted={role: round(ticks * WINDOW, 1) for role, ticks in sorted(tally.distrusted.items())},
         lacking=lacking(pipeline.vehicle),
         frames=pipeline.codec.received,
         dropped=counts.dropped,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, Codec, Handler
+from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, Accumulator, Codec, Handler
 from gz_onboard.bus.layout import PAUSE, MappedMessage, first_bit, is_not_available, raw_range
 from gz_onboard.bus.mapping import BusMapping, Protection
 from gz_onboard.bus.requests import FUNCTIONAL
@@ -32,7 +33,7 @@ Column = tuple[Array, Array]
 """Times [s] and values (SI)."""
 _WIDEST_COUNTER = 32  # bits
 _MOST_PLACES = 4096  # channels and identifiers: beyond this the codec itself decides which of them it remembers
-_NEVER = -1e9  # s
+_NEVER_NS = -1 << 62
 _NO_DATA = ERR_FLAG | RTR_FLAG
 
 
@@ -64,7 +65,7 @@ def decode_columns(frames: FrameColumns, codec: Codec) -> dict[str, Column]:
         elif message is None:
             codec.unknown[identifier] = codec.unknown.get(identifier, 0) + len(rows)
         elif handler is codec._decoders[message.name] and (layout := _layout(message, codec.mapping)):
-            found |= _decode_message(layout, codec, identifier, frames[rows], passed_ns[rows].astype(float) * 1e-9)
+            found |= _decode_message(layout, codec, identifier, frames[rows], passed_ns[rows])
         else:
             one_by_one.append(rows)
     if one_by_one:
@@ -92,19 +93,31 @@ def _handler(codec: Codec, channel: int, identifier: int) -> Handler:
 
 def _decode_one_by_one(frames: FrameColumns, passed_ns: NDArray[np.int64], codec: Codec) -> dict[str, Column]:
     """Decode frames through the handlers of the codec, at these times on its timeline."""
-    origin_ns = codec._origin_ns
+    origin_ns, samples = codec._origin_ns, dict[str, list[tuple[float, float]]]()
+    by_name = {accumulator.mapped.message.name: accumulator for accumulator in codec._accumulators}
+
+    @cache
+    def accumulators(identifier: int) -> list[Accumulator]:
+        """Those that frames with this identifier may add to."""
+        message = codec.origins.message(identifier)
+        names = [r.name for r in codec.mapping.requests if r.response == identifier]
+        names += [message.name] if message else []
+        return [by_name[name] for name in names if name in by_name]
+
     for frame, passed in zip(frames.tuples(), passed_ns.tolist(), strict=True):
         time_ns, identifier, data, channel = frame
         codec._origin_ns = time_ns - passed  # as it was then: a clock that was set moves it
-        if not _handler(codec, channel & ~TRANSMITTED, identifier)(passed * 1e-9, data):
-            codec.latest[identifier] = (time_ns, data)
+        if _handler(codec, channel & ~TRANSMITTED, identifier)(passed, data):
+            continue
+        codec.latest[identifier] = (time_ns, data)
+        for accumulator in accumulators(identifier):
+            if window := accumulator.window():
+                for source, sample in zip(accumulator.mapped.sources, window.roles, strict=True):
+                    if sample:
+                        samples.setdefault(source.role, []).append((sample.time, sample.value))
     codec._origin_ns = origin_ns
-    samples: dict[str, list[tuple[float, float]]] = {}
-    for time, group, values in codec.decode(()):
-        for role, value in zip(codec.groups[group].roles, values, strict=True):
-            if value is not None:
-                samples.setdefault(role, []).append((time, value))
-    return {role: (column[:, 0], column[:, 1]) for role, rows in samples.items() if len(column := np.array(rows))}
+    columns = {role: np.array(rows) for role, rows in samples.items()}
+    return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
 
 def _layout(message: Message, mapping: BusMapping) -> MappedMessage | None:
@@ -127,9 +140,9 @@ def _pager(message: Message, signal: Signal) -> Signal | None:
 
 
 def _decode_message(
-    mapped: MappedMessage, codec: Codec, identifier: int, frames: FrameColumns, time: Array
+    mapped: MappedMessage, codec: Codec, identifier: int, frames: FrameColumns, passed_ns: NDArray[np.int64]
 ) -> dict[str, Column]:
-    """Decode all frames of one message: (times, values) by role. time: of each frame [s]."""
+    """Decode all frames of one message, at these times on the timeline of the codec: (times, values) by role."""
     message, n, protection = mapped.message, mapped.message.length, mapped.protection
 
     def drop(bad: Mask, place: str, reason: str) -> None:
@@ -145,7 +158,7 @@ def _decode_message(
         good &= ~wrong
     if mapped.sources and protection.counter:
         rows = np.flatnonzero(good)
-        wrong, lost = _follow_counter(mapped, data[rows], time[rows])
+        wrong, lost = _follow_counter(mapped, data[rows], passed_ns[rows])
         drop(wrong, message.name, COUNTER)
         good[rows[wrong]] = False
         if lost:
@@ -154,7 +167,7 @@ def _decode_message(
     if not len(rows):
         return {}
     codec.latest[identifier] = frames[rows[-1:]].tuples()[0][0::2]
-    data, time = data[rows], time[rows]
+    data, time = data[rows], passed_ns[rows].astype(float) * 1e-9
     found = {}
     for source, signal, limits in zip(mapped.sources, mapped.signals, mapped.limits, strict=True):
         raw, present = _raw(signal, data), np.ones(len(data), bool)
@@ -180,19 +193,19 @@ def _has_right_crc(data: NDArray[np.uint8]) -> Mask:
     return right
 
 
-def _follow_counter(mapped: MappedMessage, data: NDArray[np.uint8], time: Array) -> tuple[Mask, int]:
+def _follow_counter(mapped: MappedMessage, data: NDArray[np.uint8], passed_ns: NDArray[np.int64]) -> tuple[Mask, int]:
     """(mask of the frames whose counter is wrong, how many frames it shows as missing); rules as of the live codec."""
     assert mapped.protection.counter
     counter = mapped.message.get_signal_by_name(mapped.protection.counter)
     low, high = map(int, raw_range(counter, mapped.not_available))
-    pause = STALE_PERIODS * mapped.period if mapped.period else PAUSE
+    pause_ns = round((STALE_PERIODS * mapped.period if mapped.period else PAUSE) * 1e9)
     counts = _raw(counter, data)
     wrong = (counts < low) | (counts > high)
     rows = np.flatnonzero(~wrong)
-    counts, time, modulo = counts[rows], time[rows], high - low + 1
+    counts, modulo = counts[rows], high - low + 1
     expected = np.concatenate(([low], np.where(counts < high, counts + 1, low)[:-1]))[: len(rows)]
-    since = np.diff(time, prepend=_NEVER)
-    missing = np.where(since < pause, (counts - expected) % modulo, 0)
+    since_ns = np.diff(passed_ns[rows], prepend=_NEVER_NS)
+    missing = np.where(since_ns < pause_ns, (counts - expected) % modulo, 0)
     far = (missing > 0) & (missing >= modulo // 2)
     wrong[rows[far]] = True
     return wrong, int(missing[~far].sum())

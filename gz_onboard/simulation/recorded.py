@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, held_at, running_mean
-from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
+from gz_onboard.bus.codec import LONGEST_PAUSE_NS
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import INSTRUMENTS, Event
-from gz_onboard.offline.samples import extended, open_ride, read_samples, ride_name
+from gz_onboard.events import Estimate
+from gz_onboard.offline.samples import open_ride, read_samples, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import first_soc, standing_load
 from gz_onboard.physics.sensors import speed_role, true_columns
+from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.timeline import stray
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
@@ -107,40 +107,26 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     """
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
-    mapping, frames = open_ride(log, vehicle)
-    codec = Codec(extended(mapping), LONGEST_PAUSE_NS)
-    estimator_groups = [replace(g, roles=()) if set(INSTRUMENTS).intersection(g.roles) else g for g in codec.groups]
-    estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
-    known = [bool(group.roles) for group in estimator_groups]
+    columns = true_columns(read_samples(log, vehicle, progress).columns, vehicle.parameters)
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
     headings: list[tuple[float, float]] = []
     rough: list[tuple[float, float, float]] = []  # time, distance, vibration
     reads_vibration = "vibration" in vehicle.model.reads
-    tick = 0.0
 
-    def observe(event: Event) -> None:
-        nonlocal tick
-        if not known[event[1]]:
-            return
-        estimator.handle(event)
-        if event[0] >= tick:
-            tick = event[0] + 0.1
-            road = estimator.road
-            speed = road.speed or 0.0
-            turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
-            rows.append((road.distance, road.grade or 0.0, turning))
-            if road.heading is not None and speed > _MOVING:
-                headings.append((road.distance, road.heading))
-            if reads_vibration:
-                rough.append((event[0], road.distance, estimator.vibration(event[0])))
+    def observe(estimate: Estimate) -> None:
+        road, speed = pipeline.estimator.road, estimate.speed or 0.0
+        turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
+        rows.append((road.distance, road.grade or 0.0, turning))
+        if road.heading is not None and speed > _MOVING:
+            headings.append((road.distance, road.heading))
+        if reads_vibration:
+            rough.append((estimate.time, road.distance, pipeline.estimator.vibration(estimate.time)))
 
-    columns = true_columns(read_samples(log, vehicle).columns, vehicle.parameters)
-    kept = frames[~stray(frames.time_ns)]
-    for batch in kept.batches():
-        for event in codec.decode(batch):
-            observe(event)
-        if progress:
-            progress(len(batch))
+    mapping, frames = open_ride(log, vehicle)
+    pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
+    pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
+    for batch in frames[~stray(frames.time_ns)].batches():
+        pipeline.advance(batch, batch[-1][0])
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Assembler
 from gz_onboard.bus.codec import LENGTH, RANGE, Codec
 from gz_onboard.bus.signals import Decoder
-from gz_onboard.events import Event, Frame
+from gz_onboard.events import Frame
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, events_of
 from tests.polled import KONA, STEADY, answer, carried, exchange, kona, payload, request
 from tests.support import EPOCH, MS, S
 
@@ -34,7 +35,7 @@ class Taken:
 
 def decoded(frames: list[Frame]) -> tuple[Codec, list[Event]]:
     codec = Codec(kona().mapping)
-    return codec, codec.decode(frames)
+    return codec, events_of(codec, frames)
 
 
 @given(st.lists(PAYLOADS, max_size=5), st.sampled_from([None, 0xF1]))

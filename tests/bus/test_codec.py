@@ -30,9 +30,10 @@ from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.units import to_si
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Event, Frame
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, events_of
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -108,7 +109,7 @@ def expected(message, signal, raw):
 
 
 def assert_like_cantools(codec: Codec, message, data: bytes, time_ns: int) -> None:
-    (event,) = codec.decode([(time_ns, message.frame_id, data, 0)])
+    (event,) = events_of(codec, [(time_ns, message.frame_id, data, 0)])
     raw = message.decode(data, decode_choices=False, scaling=False)
     assert len(event[2]) == len(message.signals)
     for signal, value in zip(message.signals, event[2], strict=True):
@@ -175,7 +176,7 @@ def test_any_layout_is_decoded_as_by_cantools(dbc, data):
 def test_limits_are_kept_to_the_last_step():
     codec = Codec(reference())
     for i, (volts, good) in enumerate([(0.0, True), (100.0, True), (100.01, False), (655.34, False)]):
-        (event,) = codec.decode([pack(i, EPOCH + i * 100 * MS, BMS_PackVoltage=volts)])
+        (event,) = events_of(codec, [pack(i, EPOCH + i * 100 * MS, BMS_PackVoltage=volts)])
         assert value_of(codec, event, "pack_voltage") == (pytest.approx(volts) if good else None)
         assert value_of(codec, event, "pack_current") == 0.0
     assert codec.faults == {("BMS_Pack.BMS_PackVoltage", RANGE): 2}
@@ -186,7 +187,7 @@ def test_limits_are_kept_to_the_last_step():
 
 def test_codes_for_not_available_are_no_numbers():
     codec = Codec(reference())
-    (event,) = codec.decode([pack(0, EPOCH, BMS_PackVoltage=655.35, BMS_PackCurrent=-327.68, BMS_StateOfCharge=50)])
+    (event,) = events_of(codec, [pack(0, EPOCH, BMS_PackVoltage=655.35, BMS_PackCurrent=-327.68, BMS_StateOfCharge=50)])
     assert value_of(codec, event, "pack_voltage") is None
     assert value_of(codec, event, "pack_current") is None
     assert value_of(codec, event, "bms_state_of_charge") == pytest.approx(0.5)
@@ -208,8 +209,8 @@ def test_without_such_codes_all_ones_are_a_number(tmp_path):
     data = b"\xff\x7f\x00\x80\x00\x00\x00\x00"
     with_codes = Codec(mapping_of(tmp_path, DBC_SHORT, ROLES_SHORT))
     without = Codec(mapping_of(tmp_path, DBC_SHORT, ROLES_SHORT, 'not_available = "none"'))
-    assert with_codes.decode([(0, 256, data, 0)])[0][2] == (None, 127.0, None)  # 7 bits are too few for a code
-    assert without.decode([(0, 256, data, 0)])[0][2] == pytest.approx((215.0, 127.0, -3276.8))
+    assert events_of(with_codes, [(0, 256, data, 0)])[0][2] == (None, 127.0, None)  # 7 bits are too few for a code
+    assert events_of(without, [(0, 256, data, 0)])[0][2] == pytest.approx((215.0, 127.0, -3276.8))
 
 
 # --- protection -----------------------------------------------------------------------------------------------
@@ -220,14 +221,14 @@ def test_a_flipped_bit_drops_the_frame(bit, counter, raw):
     codec = Codec(reference())
     data = bytearray(protected("BMS_Pack", counter, BMS_PackVoltage=raw / 1000))
     data[bit // 8] ^= 1 << bit % 8
-    assert codec.decode([(EPOCH, 0x200, bytes(data), 0)]) == []
+    assert events_of(codec, [(EPOCH, 0x200, bytes(data), 0)]) == []
     assert codec.faults == {("BMS_Pack", CRC): 1}
     assert codec.latest == {}
 
 
 def test_counters_count_and_wrap():
     codec = Codec(reference())
-    events = codec.decode([pack(i % 15, EPOCH + i * 100 * MS) for i in range(40)])
+    events = events_of(codec, [pack(i % 15, EPOCH + i * 100 * MS) for i in range(40)])
     assert len(events) == 40
     assert not codec.faults and not codec.lost
 
@@ -235,7 +236,7 @@ def test_counters_count_and_wrap():
 def test_a_small_step_is_frames_lost_and_a_repeated_or_far_counter_is_wrong():
     codec = Codec(reference())
     counters = [3, 4, 4, 7, 14, 0, 8, 9]
-    events = codec.decode([pack(c, EPOCH + i * 100 * MS) for i, c in enumerate(counters)])
+    events = events_of(codec, [pack(c, EPOCH + i * 100 * MS) for i, c in enumerate(counters)])
     # 4 -> 4 repeated; 4 -> 7: two lost; 7 -> 14: six lost; 0 -> 8: too far; 8 -> 9 follows
     assert [round(time * 10) for time, _, _ in events] == [0, 1, 3, 4, 5, 7]
     assert codec.faults == {("BMS_Pack", COUNTER): 2}
@@ -245,7 +246,7 @@ def test_a_small_step_is_frames_lost_and_a_repeated_or_far_counter_is_wrong():
 def test_after_a_pause_any_counter_is_good_but_not_one_that_cannot_be():
     codec = Codec(reference())
     frames = [pack(5, EPOCH), pack(5, EPOCH + 1100 * MS), pack(15, EPOCH + 2300 * MS), pack(6, EPOCH + 2400 * MS)]
-    assert len(codec.decode(frames)) == 3
+    assert len(events_of(codec, frames)) == 3
     assert codec.faults == {("BMS_Pack", COUNTER): 1}
     assert not codec.lost
 
@@ -256,7 +257,7 @@ def test_counters_by_their_rule(counters):
     last: int | None = None
     lost = wrong = 0
     for i, c in enumerate(counters):
-        events = codec.decode([pack(c, EPOCH + i * 100 * MS)])
+        events = events_of(codec, [pack(c, EPOCH + i * 100 * MS)])
         step = 1 if last is None else (c - last) % 15
         good = c <= 14 and 1 <= step <= 7
         if c <= 14:
@@ -276,7 +277,7 @@ def test_counters_by_their_rule(counters):
 def test_a_wrong_length_drops_the_frame(length):
     codec = Codec(reference())
     for identifier in (0x101, 0x200, 0x411):  # plain, protected, without a role
-        assert codec.decode([(EPOCH, identifier, bytes(length), 0)]) == []
+        assert events_of(codec, [(EPOCH, identifier, bytes(length), 0)]) == []
     assert codec.faults == {("INV_Power", LENGTH): 1, ("BMS_Pack", LENGTH): 1, ("HBM_Chassis", LENGTH): 1}
     assert codec.latest == {}
 
@@ -284,7 +285,7 @@ def test_a_wrong_length_drops_the_frame(length):
 def test_remote_and_error_frames_are_no_data():
     codec = Codec(reference())
     frames = [(EPOCH, 0x101 | RTR_FLAG, bytes(8), 0), (EPOCH, 0x4 | ERR_FLAG, bytes(8), 0)]
-    assert codec.decode(frames * 3) == []
+    assert events_of(codec, frames * 3) == []
     assert codec.error_frames == 3
     assert codec.unknown == {0x101 | RTR_FLAG: 3}
     assert not codec.faults
@@ -292,7 +293,7 @@ def test_remote_and_error_frames_are_no_data():
 
 def test_an_11_bit_identifier_is_not_the_29_bit_one():
     codec = Codec(reference())
-    assert codec.decode([(EPOCH, 0x101 | EFF_FLAG, bytes(8), 0)]) == []
+    assert events_of(codec, [(EPOCH, 0x101 | EFF_FLAG, bytes(8), 0)]) == []
     assert codec.unknown == {0x101 | EFF_FLAG: 1}
 
 
@@ -300,8 +301,8 @@ def test_a_babbling_node_does_not_fill_the_memory():
     codec = Codec(reference())
     count = 20_000
     frames = [(EPOCH, EFF_FLAG | i, b"", 0) for i in range(count)]
-    assert codec.decode(frames) == []
-    assert codec.decode([temperatures(EPOCH + MS)])
+    assert events_of(codec, frames) == []
+    assert events_of(codec, [temperatures(EPOCH + MS)])
     assert len(codec.unknown) < 5000
     assert sum(codec.unknown.values()) + codec.unknown_others == count
     assert sum(map(len, codec._handlers.values())) < 5000
@@ -312,7 +313,7 @@ def test_latest_and_values_hold_only_what_is_good():
     codec = Codec(reference())
     good = pack(0, EPOCH, BMS_PackVoltage=50.0, BMS_PackCurrent=-327.68, BMS_StateOfCharge=120.0)
     bad = (EPOCH + 100 * MS, 0x200, bytes(8), 0)
-    codec.decode([good, bad])
+    events_of(codec, [good, bad])
     assert codec.latest == {0x200: (EPOCH, good[2])}
     values = codec.values(0x200, good[2])
     assert values["BMS_PackVoltage"] == pytest.approx(50.0)
@@ -328,7 +329,7 @@ def test_latest_and_values_hold_only_what_is_good():
 
 def test_times_are_seconds_since_the_first_frame():
     codec = Codec(reference())
-    events = codec.decode([temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
+    events = events_of(codec, [temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
     assert [time for time, _, _ in events] == [0.0, 1.5]
     assert codec.seconds(EPOCH + S) == 1.0
 
@@ -336,7 +337,7 @@ def test_times_are_seconds_since_the_first_frame():
 @pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62, -(2**62), -(2**63), -(2**70)])
 def test_a_log_may_begin_at_any_time(start):
     codec = Codec(reference())
-    events = codec.decode([temperatures(start), temperatures(start + 100 * MS)])
+    events = events_of(codec, [temperatures(start), temperatures(start + 100 * MS)])
     assert [time for time, _, _ in events] == pytest.approx([0.0, 0.1])
     assert not codec.faults
 
@@ -344,14 +345,14 @@ def test_a_log_may_begin_at_any_time(start):
 def test_two_channels_may_overtake_each_other_a_little():
     codec = Codec(reference())
     offsets = [0, 30, 10, 40, 20, 60, 15]
-    events = codec.decode([temperatures(EPOCH + ms * MS) for ms in offsets])
+    events = events_of(codec, [temperatures(EPOCH + ms * MS) for ms in offsets])
     assert [round(time * 1e3) for time, _, _ in events] == offsets
     assert not codec.faults
 
 
 def test_time_does_not_creep_backwards():
     codec = Codec(reference())
-    events = codec.decode([temperatures(EPOCH + S - i * 40 * MS) for i in range(3)])
+    events = events_of(codec, [temperatures(EPOCH + S - i * 40 * MS) for i in range(3)])
     assert len(events) == 2  # the third is 80 ms behind the first
     assert codec.faults == {("", TIME): 1}
 
@@ -364,16 +365,16 @@ def test_single_odd_stamps_are_dropped_however_many(odd):
         frames.append(temperatures(EPOCH + i * 100 * MS))
         if i % 5 == 2:
             frames.append(temperatures(EPOCH + i * 100 * MS + odd))
-    events = codec.decode(frames)
+    events = events_of(codec, frames)
     assert [time for time, _, _ in events] == pytest.approx([i * 0.1 for i in range(50)])
     assert codec.faults == {("", TIME): 10}
 
 
 def test_wild_stamps_never_agree_on_a_time():
     codec = Codec(reference())
-    codec.decode([temperatures(EPOCH)])
-    assert codec.decode([temperatures(EPOCH + (i * i + 20) * 60 * S) for i in range(1, 20)]) == []
-    (event,) = codec.decode([temperatures(EPOCH + S)])
+    events_of(codec, [temperatures(EPOCH)])
+    assert events_of(codec, [temperatures(EPOCH + (i * i + 20) * 60 * S) for i in range(1, 20)]) == []
+    (event,) = events_of(codec, [temperatures(EPOCH + S)])
     assert event[0] == 1.0
 
 
@@ -381,7 +382,7 @@ def test_a_clock_set_back_does_not_turn_the_timeline_back():
     codec = Codec(reference())
     frames = [temperatures(EPOCH + i * 100 * MS) for i in range(10)]
     frames += [temperatures(EPOCH - 3600 * S + i * 100 * MS) for i in range(10)]
-    times = [time for time, _, _ in codec.decode(frames)]
+    times = [time for time, _, _ in events_of(codec, frames)]
     assert len(times) == 18  # two to make sure
     assert times == sorted(times)
     assert times[-1] == pytest.approx(0.9 + 0.7)
@@ -391,7 +392,7 @@ def test_a_clock_set_back_does_not_turn_the_timeline_back():
 def test_a_gap_is_a_gap():
     codec = Codec(reference())
     frames = [temperatures(EPOCH), *(temperatures(EPOCH + 600 * S + i * 100 * MS) for i in range(4))]
-    assert [time for time, _, _ in codec.decode(frames)] == pytest.approx([0.0, 600.2, 600.3])
+    assert [time for time, _, _ in events_of(codec, frames)] == pytest.approx([0.0, 600.2, 600.3])
 
 
 @pytest.mark.parametrize("days", [31, 20_000, -20_000])
@@ -399,22 +400,22 @@ def test_in_a_log_a_leap_of_a_month_is_a_clock_that_was_set(days):
     frames = [temperatures(EPOCH + 20_000 * DAY + i * 100 * MS) for i in range(10)]
     frames += [temperatures(EPOCH + (20_000 + days) * DAY + i * 100 * MS) for i in range(10)]
     codec = Codec(reference(), LONGEST_PAUSE_NS)
-    times = [time for time, _, _ in codec.decode(frames)]
+    times = [time for time, _, _ in events_of(codec, frames)]
     assert times == sorted(times)
     assert times[-1] == pytest.approx(0.9 + 0.7)
     ((when, leap),) = codec.leaps
     assert when == pytest.approx(0.9)
     assert leap == pytest.approx(days * 86_400.0, abs=1.0)
     live = Codec(reference())  # where a pause may be of any length
-    assert max(time for time, _, _ in live.decode(frames)) == pytest.approx(max(days, 0) * 86_400.0, abs=2.0)
+    assert max(time for time, _, _ in events_of(live, frames)) == pytest.approx(max(days, 0) * 86_400.0, abs=2.0)
 
 
 def test_clock_set_goes_on_with_the_timeline():
     codec = Codec(reference())
     codec.clock_set(S)  # before the first frame there is nothing to go on with
-    codec.decode([temperatures(EPOCH)])
+    events_of(codec, [temperatures(EPOCH)])
     codec.clock_set(-86400 * S)
-    (event,) = codec.decode([temperatures(EPOCH - 86400 * S + 100 * MS)])
+    (event,) = events_of(codec, [temperatures(EPOCH - 86400 * S + 100 * MS)])
     assert event[0] == pytest.approx(0.1)
     assert not codec.faults
 
@@ -438,19 +439,19 @@ def test_j1939_goes_by_the_parameter_group(tmp_path):
     codec = Codec(mapping)
     speed = bytes([0xFF, 0xFF, 0xFF, 0x40, 0x1F, 0xFF, 0xFF, 0xFF])  # 8000 * 0.125 = 1000 rpm
     for identifier in (0x0CF00431, 0x0CF00400, 0x18F00400):  # another sender until its own is heard; another priority
-        (event,) = codec.decode([(0, identifier | EFF_FLAG, speed, 0)])
+        (event,) = events_of(codec, [(0, identifier | EFF_FLAG, speed, 0)])
         assert value_of(codec, event, "motor_speed") == pytest.approx(1000 * 2 * math.pi / 60)
         assert codec.message_name(identifier | EFF_FLAG) == "EEC1"
         assert codec.values(identifier | EFF_FLAG, speed) == {"EngineSpeed": 1000.0}
-    assert codec.decode([(0, 0x0CF00431 | EFF_FLAG, speed, 0)]) == []
+    assert events_of(codec, [(0, 0x0CF00431 | EFF_FLAG, speed, 0)]) == []
     assert codec.copies == 1
     for identifier in (0x18EA0021, 0x18EAFF21):  # PDU1: the destination is no part of the group
-        (event,) = codec.decode([(0, identifier | EFF_FLAG, b"\x05\x00\x00", 0)])
+        (event,) = events_of(codec, [(0, identifier | EFF_FLAG, b"\x05\x00\x00", 0)])
         assert value_of(codec, event, "throttle") == 5.0
-    (event,) = codec.decode([(0, 256, b"\x64\x00" + bytes(6), 0)])
+    (event,) = events_of(codec, [(0, 256, b"\x64\x00" + bytes(6), 0)])
     assert value_of(codec, event, "pack_voltage") == pytest.approx(10.0)
     for identifier in (0x0CF00500 | EFF_FLAG, 0x0CF00400 | EFF_FLAG | RTR_FLAG, 0x400):
-        assert codec.decode([(0, identifier, speed, 0)]) == []
+        assert events_of(codec, [(0, identifier, speed, 0)]) == []
     assert len(codec.unknown) == 3
     assert known_identifiers(mapping) is None
 
@@ -476,7 +477,7 @@ def test_copies_from_a_gateway_are_taken_once(tmp_path, late):
     """late: by so many frames."""
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
     volts = [3600 + i for i in range(50)]
-    events = codec.decode(on_two_buses(list(zip(volts[late:], volts, strict=False))))
+    events = events_of(codec, on_two_buses(list(zip(volts[late:], volts, strict=False))))
     assert [event[2][0] for event in events] == [pytest.approx(v / 10) for v in volts[late:]]
     assert not codec.origins.conflicts and not codec.faults
     assert codec.copies == 50 - late
@@ -485,7 +486,7 @@ def test_copies_from_a_gateway_are_taken_once(tmp_path, late):
 def test_one_identifier_with_two_meanings_is_dropped_and_named(tmp_path):
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
     frames = on_two_buses([(3600 + i, 120 + i) for i in range(50)])
-    events = codec.decode(frames)
+    events = events_of(codec, frames)
     assert len(events) <= 10
     assert codec.faults[("Pack", CONFLICT)] + codec.copies + len(events) == len(frames)
     said = codec.origins.conflicts["Pack"]
@@ -500,8 +501,8 @@ def on_one_bus(channel: int, volts: list[int], first: int) -> list[Frame]:
 
 def test_copies_take_over_where_the_first_place_falls_silent(tmp_path):
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
-    events = codec.decode(on_two_buses([(3600 + i, 3600 + i) for i in range(20)]))
-    events += codec.decode(on_one_bus(1, [3700 + i for i in range(100)], 20))
+    events = events_of(codec, on_two_buses([(3600 + i, 3600 + i) for i in range(20)]))
+    events += events_of(codec, on_one_bus(1, [3700 + i for i in range(100)], 20))
     assert not codec.origins.conflicts and not codec.faults
     assert len(events) >= 20 + 100 - 22  # two seconds until the silence is one
     assert events[-1][2][0] == pytest.approx(379.9)
@@ -510,8 +511,8 @@ def test_copies_take_over_where_the_first_place_falls_silent(tmp_path):
 @pytest.mark.parametrize("volts", [[3600, 3601] * 60, [120 + i for i in range(120)]])
 def test_what_goes_on_elsewhere_and_was_never_a_copy_is_refused(tmp_path, volts):
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"'))
-    codec.decode(on_one_bus(0, [3600, 3601] * 60, 0))
-    assert codec.decode(on_one_bus(1, volts, 120)) == []
+    events_of(codec, on_one_bus(0, [3600, 3601] * 60, 0))
+    assert events_of(codec, on_one_bus(1, volts, 120)) == []
     assert "0x100 comes on channels 0 and 1" in codec.origins.conflicts["Pack"]
     assert codec.heard("Pack") == [(0, 256), (1, 256)]
 
@@ -519,7 +520,7 @@ def test_what_goes_on_elsewhere_and_was_never_a_copy_is_refused(tmp_path, volts)
 @pytest.mark.parametrize("key", ["channel = 1\n", "\n[bus.messages.Pack]\nchannel = 1\n"])
 def test_the_vehicle_file_says_on_which_channel_a_message_is(tmp_path, key):
     codec = Codec(mapping_of(tmp_path, TWO_BUSES, 'pack_voltage = "Volts"', key))
-    events = codec.decode(on_two_buses([(120 + i, 3600 + i) for i in range(50)]))
+    events = events_of(codec, on_two_buses([(120 + i, 3600 + i) for i in range(50)]))
     assert [event[2][0] for event in events] == [pytest.approx((3600 + i) / 10) for i in range(50)]
     assert not codec.origins.conflicts and not codec.faults
 
@@ -542,21 +543,21 @@ def two_senders(first: int, second: int) -> list[Frame]:
 )
 def test_a_parameter_group_is_that_of_one_sender(tmp_path, senders, key, expected):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"\n' + key))
-    values = [event[2][0] for event in codec.decode(two_senders(*senders))]
+    values = [event[2][0] for event in events_of(codec, two_senders(*senders))]
     assert values[-49:] == [expected + i for i in range(1, 50)]
     assert not codec.origins.conflicts
 
 
 def test_two_senders_that_nobody_names_are_a_contradiction(tmp_path):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
-    assert len(codec.decode(two_senders(0xF2, 0xF3))) <= 10
+    assert len(events_of(codec, two_senders(0xF2, 0xF3))) <= 10
     assert "group 0xea00 comes from senders 0xf2 and 0xf3 with different data" in codec.origins.conflicts["Request"]
 
 
 def test_j1939_senders_without_end_do_not_fill_the_memory(tmp_path):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
     count = 20_000
-    events = codec.decode([(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
+    events = events_of(codec, [(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
     assert sum(map(len, codec._handlers.values())) < 5000 and len(codec.latest) < 5000
     assert len(events) + codec.copies == count
     assert not codec.unknown and not codec.unknown_others
@@ -564,10 +565,10 @@ def test_j1939_senders_without_end_do_not_fill_the_memory(tmp_path):
 
 def test_j1939_one_that_babbles_first_keeps_no_known_group_out(tmp_path):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
-    codec.decode([(0, 0x18F10000 | EFF_FLAG | i, bytes(3), 0) for i in range(10_000)])
-    (event,) = codec.decode([(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00\x00", 0)])
+    events_of(codec, [(0, 0x18F10000 | EFF_FLAG | i, bytes(3), 0) for i in range(10_000)])
+    (event,) = events_of(codec, [(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00\x00", 0)])
     assert value_of(codec, event, "throttle") == 5.0
-    assert codec.decode([(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00", 0)]) == []
+    assert events_of(codec, [(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00", 0)]) == []
     assert codec.faults == {("Request", LENGTH): 1}
     assert sum(codec.unknown.values()) + codec.unknown_others == 10_000
 
@@ -604,7 +605,7 @@ def test_floats(tmp_path):
     ]
     for single, bare, want in cases:
         data = struct.pack("<ff", single, bare)
-        (event,) = codec.decode([(0, 256, data, 0)])
+        (event,) = events_of(codec, [(0, 256, data, 0)])
         assert event[2] == want
         assert all(v is None or math.isfinite(v) for v in codec.values(256, data).values())
     assert codec.faults == {
@@ -613,10 +614,10 @@ def test_floats(tmp_path):
         ("Floats.Bare", RANGE): 1,
         ("Floats.Bare", NOT_AVAILABLE): 1,
     }
-    assert codec.decode([(0, 257, struct.pack(">d", 25.25), 0)])[0][2] == (25.25,)
-    assert codec.decode([(0, 257, struct.pack(">d", math.nan), 0)])[0][2] == (None,)
-    assert codec.decode([(0, 257, struct.pack(">d", 1.7e308), 0)])[0][2] == (None,)
-    assert codec.decode([(0, 256, b"1234567", 0)]) == []
+    assert events_of(codec, [(0, 257, struct.pack(">d", 25.25), 0)])[0][2] == (25.25,)
+    assert events_of(codec, [(0, 257, struct.pack(">d", math.nan), 0)])[0][2] == (None,)
+    assert events_of(codec, [(0, 257, struct.pack(">d", 1.7e308), 0)])[0][2] == (None,)
+    assert events_of(codec, [(0, 256, b"1234567", 0)]) == []
 
 
 MULTIPLEXED = """BO_ 256 Mux: 8 A
@@ -638,7 +639,7 @@ def mux(page: int, counter: int, words: bytes) -> bytes:
 
 def test_multiplexed_signals(tmp_path):
     codec = Codec(mapping_of(tmp_path, MULTIPLEXED, MUX_ROLES, MUX_BUS))
-    decode = lambda i, data: codec.decode([(i * 100 * MS, 256, data, 0)])  # noqa: E731
+    decode = lambda i, data: events_of(codec, [(i * 100 * MS, 256, data, 0)])  # noqa: E731
     assert decode(0, mux(0, 0, struct.pack("<Hh", 5000, -123)))[0][2] == pytest.approx((50.0, -12.3, None))
     assert decode(1, mux(1, 1, b"\x41"))[0][2] == (None, None, 25.0)
     assert decode(2, mux(0, 2, struct.pack("<Hh", 65535, 5000)))[0][2] == (None, None, None)
@@ -660,7 +661,7 @@ def test_a_page_that_the_dbc_does_not_list_keeps_the_signals_of_every_page(tmp_p
     codec = Codec(mapping)
     pages = [struct.pack("<BHH", page, 3700, 3600) + struct.pack(">h", -240) + b"\0" for page in range(20)]
     frames: list[Frame] = [(i * 100 * MS, 256, data, 0) for i, data in enumerate(pages)]
-    values = [event[2] for event in codec.decode(frames)]
+    values = [event[2] for event in events_of(codec, frames)]
     assert values[0] == pytest.approx((360.0, -24.0, 3.7))
     assert all(value == pytest.approx((360.0, -24.0, None)) for value in values[1:])
     assert not codec.faults
@@ -672,9 +673,9 @@ def test_a_page_that_the_dbc_does_not_list_keeps_the_signals_of_every_page(tmp_p
 def test_multiplexed_messages_are_protected_too(tmp_path):
     codec = Codec(mapping_of(tmp_path, MULTIPLEXED, MUX_ROLES, MUX_BUS))
     good = mux(0, 3, struct.pack("<Hh", 5000, 0))
-    assert len(codec.decode([(0, 256, good, 0)])) == 1
-    assert codec.decode([(0, 256, good, 0)]) == []
-    assert codec.decode([(0, 256, good[:-1] + b"\0", 0)]) == []
+    assert len(events_of(codec, [(0, 256, good, 0)])) == 1
+    assert events_of(codec, [(0, 256, good, 0)]) == []
+    assert events_of(codec, [(0, 256, good[:-1] + b"\0", 0)]) == []
     assert codec.faults == {("Mux", COUNTER): 1, ("Mux", CRC): 1}
 
 
@@ -731,7 +732,7 @@ def test_whatever_the_bus_brings(frames):
     }
     for n, frame in enumerate(frames, 1):
         before = accounted(codec)
-        events = codec.decode([frame])
+        events = events_of(codec, [frame])
         counted = accounted(codec) - before
         quiet = frame[1] in roleless and len(frame[2]) == 8 and not counted
         assert len(events) + counted + quiet == 1
@@ -753,7 +754,7 @@ def test_whatever_the_bus_brings(frames):
 @given(recordings())
 def test_portions_do_not_matter(frames):
     one, many = Codec(reference()), Codec(reference())
-    assert one.decode(frames) == [event for frame in frames for event in many.decode([frame])]
+    assert events_of(one, frames) == [event for frame in frames for event in events_of(many, [frame])]
     assert (one.faults, one.lost, one.unknown, one.latest) == (many.faults, many.lost, many.unknown, many.latest)
 
 
@@ -788,7 +789,7 @@ def test_whatever_comes_to_cantools(odd_mapping, frames):
     codec = Codec(odd_mapping)
     for i, (identifier, data) in enumerate(frames):
         before = accounted(codec)
-        events = codec.decode([(i * MS, identifier, data, 0)])
+        events = events_of(codec, [(i * MS, identifier, data, 0)])
         # A page that the DBC does not list holds none of the roles' signals, and is no fault.
         unlisted_page = identifier == 256 and any(byte & 15 > 1 for byte in data[:1])
         quiet = unlisted_page or identifier in (302, 0x10EA1122 | EFF_FLAG)
@@ -809,6 +810,6 @@ def test_raw_values_are_those_of_whole_frames():
 
 def test_no_time_of_the_timeline_is_before_1970_by_a_clock_that_was_set_back():
     codec = Codec(reference())
-    codec.decode([(i * 50 * MS % (1000 * MS), 0x777, b"", 0) for i in range(60)])
+    events_of(codec, [(i * 50 * MS % (1000 * MS), 0x777, b"", 0) for i in range(60)])
     assert codec.time_ns(0.0) == 0
     assert codec.time_ns(codec.seconds(codec.last_ns)) == codec.last_ns == 950 * MS

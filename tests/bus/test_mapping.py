@@ -16,6 +16,7 @@ from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
 from gz_onboard.toml import Table
+from tests.events import events_of
 
 DBC = """\
 VERSION "1"
@@ -97,7 +98,7 @@ def test_offset_and_scale_reach_the_events(tmp_path):
     roles = 'motor_temperature = "Heat"\nmotor_speed = { signal = "Speed", scale = -2, offset = 10 }'
     codec = Codec(mapping(tmp_path, roles))
     assert codec.groups[0].roles == ("motor_temperature", "motor_speed")
-    (event,) = codec.decode([(0, 257, b"\x3c\x00\x00\xfe", 0)])  # 60 rpm; 254 - 40 = 214 K
+    (event,) = events_of(codec, [(0, 257, b"\x3c\x00\x00\xfe", 0)])  # 60 rpm; 254 - 40 = 214 K
     assert event[2] == pytest.approx((214 - 273.15, -2 * 6.283185307 + 10))
 
 
@@ -413,7 +414,7 @@ def test_limits_as_wide_as_a_float_are_none(tmp_path, limits):
         "SIG_VALTYPE_ 256 Voltage : 1;\n"
     )
     codec = Codec(mapping(tmp_path, 'pack_voltage = "Voltage"', dbc=text))
-    ((_, _, values),) = codec.decode([(0, 256, struct.pack("<f", 52.5), 0)])
+    ((_, _, values),) = events_of(codec, [(0, 256, struct.pack("<f", 52.5), 0)])
     assert values == (52.5,)
 
 

@@ -11,6 +11,7 @@ from gz_onboard.bus.codec import RANGE, Codec
 from gz_onboard.bus.mapping import read_mapping
 from gz_onboard.events import PLAUSIBLE, ROLES
 from gz_onboard.toml import Table
+from tests.events import events_of
 
 DBC = """VERSION "1"
 NS_ :
@@ -43,7 +44,7 @@ def test_a_state_of_charge_in_percent_without_its_unit_is_not_taken_for_one(tmp_
     roles = ROLES_OF_IT.replace("ambient_temperature", "bms_state_of_charge")
     for raw, values in ((10, [1.0]), (650, [None])):  # 1.0 is full, 65 are percent
         it = codec(tmp_path, dbc, roles)
-        ((_, group, found),) = it.decode([(10**18, 256, struct.pack("<hhf", raw, 300, 52.0), 0)])
+        ((_, group, found),) = events_of(it, [(10**18, 256, struct.pack("<hhf", raw, 300, 52.0), 0)])
         named = dict(zip(it.groups[group].roles, found, strict=True))
         assert [named["bms_state_of_charge"]] == values
     assert it.faults == {("M.Ambient", RANGE): 1}
@@ -52,7 +53,7 @@ def test_a_state_of_charge_in_percent_without_its_unit_is_not_taken_for_one(tmp_
 def test_no_cell_has_the_millivolts_of_one_as_volts(tmp_path: Path):
     it = codec(tmp_path, roles=ROLES_OF_IT.replace("pack_voltage", "lowest_cell_voltage"))
     for raw, value in ((3.5, 3.5), (3500.0, None), (6.1, None)):
-        ((_, group, found),) = it.decode([(10**18, 256, struct.pack("<hhf", 200, 300, raw), 0)])
+        ((_, group, found),) = events_of(it, [(10**18, 256, struct.pack("<hhf", 200, 300, raw), 0)])
         assert dict(zip(it.groups[group].roles, found, strict=True))["lowest_cell_voltage"] == value
     assert it.faults == {("M.Volts", RANGE): 2}
 
@@ -76,7 +77,7 @@ def test_every_role_has_a_unit_of_which_it_is_said_what_is_plausible():
 def test_what_is_beyond_is_left_out_and_counted(tmp_path: Path, raw: tuple[int, int, float], signal: str):
     it = codec(tmp_path)
     good = struct.pack("<hhf", 200, 300, 52.0)
-    events = it.decode([(10**18, 256, good, 0), (10**18 + 10**8, 256, struct.pack("<hhf", *raw), 0)])
+    events = events_of(it, [(10**18, 256, good, 0), (10**18 + 10**8, 256, struct.pack("<hhf", *raw), 0)])
     (_, group, before), (_, _, after) = events
     roles = it.groups[group].roles
     assert dict(zip(roles, before, strict=True)) == pytest.approx(

@@ -20,6 +20,7 @@ from gz_onboard.bus.publisher import SIGMA, SOC, Counts, Publisher, reason_signa
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Cause, Estimate, Explanation, Reason, State
 from gz_onboard.toml import Table
+from tests.events import events_of
 
 DATABASES = {name: load_database([find_dbc(name)]) for name in ("range.dbc", "range_large.dbc")}
 DATABASE = DATABASES["range.dbc"]
@@ -433,7 +434,7 @@ def test_our_own_codec_takes_what_we_send(tmp_path: Path):
         frames += publisher.status(estimate, i * 100_000_000)
         if i % 10 == 0:
             frames += publisher.range(estimate, Counts(), i * 100_000_000)
-    events = codec.decode(frames)
+    events = events_of(codec, frames)
     assert not codec.faults and not codec.lost and not codec.unknown
     by_role: dict[str, list[float | None]] = {}
     for _, group, values in events:

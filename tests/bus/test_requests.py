@@ -14,6 +14,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG
 from gz_onboard.pipeline import range_publisher
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import events_of
 from tests.polled import KONA, STEADY, carried, kona, payload
 from tests.support import EPOCH, MS
 
@@ -59,7 +60,7 @@ def test_a_pid_of_obd(tmp_path: Path):
         ('{ byte = "AF", factor = 0.5,', '{ byte = "A", factor = 0.39215686,'),
     )
     codec = Codec(read_vehicle(file).mapping)
-    (event,) = codec.decode([(EPOCH, 0x7EC, carried(b"\x41\x5b\xff")[0], 0)])
+    (event,) = events_of(codec, [(EPOCH, 0x7EC, carried(b"\x41\x5b\xff")[0], 0)])
     assert event[2][0] == pytest.approx(1.0)
 
 
@@ -71,7 +72,9 @@ def test_identifiers_of_29_bits_are_exact_whatever_the_bus(tmp_path: Path, bus: 
     assert (battery.request, battery.response) == (0x18DA10F1 | EFF_FLAG, 0x18DAF110 | EFF_FLAG)
     for identifier, expected in ((0x18DAF110 | EFF_FLAG, 1), (0x18DAF111 | EFF_FLAG, 0), (0x110, 0)):
         parts = enumerate(carried(payload(battery, **STEADY)))
-        assert len(Codec(vehicle.mapping).decode([(EPOCH + i * MS, identifier, d, 0) for i, d in parts])) == expected
+        assert (
+            len(events_of(Codec(vehicle.mapping), [(EPOCH + i * MS, identifier, d, 0) for i, d in parts])) == expected
+        )
 
 
 def test_addresses_in_the_first_byte(tmp_path: Path):
@@ -84,7 +87,7 @@ def test_addresses_in_the_first_byte(tmp_path: Path):
     assert battery.addresses == (0x07, 0xF1)
     for address, expected in ((0xF1, 1), (0xF4, 0)):
         parts = enumerate(carried(payload(battery, **STEADY), address))
-        assert len(Codec(vehicle.mapping).decode([(EPOCH + i * MS, 0x7EC, d, 0) for i, d in parts])) == expected
+        assert len(events_of(Codec(vehicle.mapping), [(EPOCH + i * MS, 0x7EC, d, 0) for i, d in parts])) == expected
     other = refusal(changed(tmp_path, ("service = 0x22", own)))
     assert "0x7ec" not in other
     assert "response_identifier: is that of Battery too, which has another address" in other
@@ -211,7 +214,7 @@ def test_answers_of_a_local_identifier_are_read(tmp_path: Path):
     battery = codec.mapping.requests[1]
     assert battery.prefix == b"\x61\x05"
     parts = enumerate(carried(payload(battery, BatteryCharge=60.0)))
-    (event,) = codec.decode([(EPOCH + i * MS, 0x7EC, part, 0) for i, part in parts])
+    (event,) = events_of(codec, [(EPOCH + i * MS, 0x7EC, part, 0) for i, part in parts])
     assert event[2][0] == pytest.approx(0.6)
 
 

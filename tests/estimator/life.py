@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Event, Group
+from gz_onboard.events import Group
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import Event, EventEstimator
 from tests.support import ROOT
 
 VEHICLE = read_vehicle("reference", 75.0)
@@ -111,7 +111,7 @@ def flat_pack(**made: Any) -> Scooter:
 
 
 def estimator(groups: list[Group] | None = None, vehicle: Vehicle = VEHICLE) -> Any:  # tests know what is not None
-    return Estimator(groups or GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
+    return EventEstimator(groups or GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
 
 
 def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[float, Any]]:

@@ -7,9 +7,9 @@ from math import cos, sin
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Activity, Event, Group
+from gz_onboard.events import Activity, Group
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 RADIUS = VEHICLE.model.parameters["wheel_radius"] * VEHICLE.model.parameters["gear_ratio"]
@@ -35,7 +35,7 @@ def roll(seconds: float, start: float, watts: float, seen: tuple[str, ...]) -> I
 @pytest.mark.parametrize("seen", [(), ("inverter_current",), ("motor_torque",)])
 def test_a_tow_is_known_by_current_or_torque(seen):
     groups = [PACK, ROAD, *([Group("Motor", seen, 0.5)] if seen else [])]
-    e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for event in roll(600, 0.0, 390.0, seen):
         e.handle(event)
     before = e.forecaster.riding.usual.price.now
@@ -67,7 +67,7 @@ def stand(seconds: float, start: float, van: float, own: tuple[float, ...]) -> I
 @pytest.mark.parametrize("witness", WITNESSES)
 def test_a_scooter_in_a_van_is_parked(witness):
     own = WITNESSES[witness]
-    e = Estimator([PACK, own, GPS], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator([PACK, own, GPS], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     riding = e.forecaster.riding
     rest = (1234000.0,) if witness == "odometer" else (0.0, 0.0)
     for event in stand(180, 0.0, 0.0, rest[: len(own.roles)]):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group, Reason, State
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 BATTERY = VEHICLE.pack
@@ -79,7 +79,7 @@ class Plant:
 
 
 def run(plant, seconds, estimator=None, lost=lambda group, t: False, begin=0.0, every=1.0):
-    estimator = estimator or Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+    estimator = estimator or EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
     rows, due = [], begin + every
     for event, true in plant.ride(seconds, lost, begin):
         estimator.handle(event)
@@ -117,7 +117,7 @@ def test_finds_back_from_a_wrong_start():
 
 def test_both_backends_estimate_the_same():
     _, a = run(Plant(), 200)
-    _, b = run(Plant(), 200, Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding, FilterpyFilter))
+    _, b = run(Plant(), 200, EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding, FilterpyFilter))
     for (_, x), (_, y) in zip(a, b, strict=True):
         assert x.soc == pytest.approx(y.soc, abs=1e-9)
         assert x.range == pytest.approx(y.range, abs=1e-3)
@@ -197,7 +197,7 @@ def test_snapshot_over_a_restart():
     plant = Plant(seed=3)
     estimator, rows = run(plant, 600)
     saved = json.loads(json.dumps(estimator.snapshot("key")))
-    fresh = Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+    fresh = EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
     fresh.restore(saved, "key", 5.0)
     _, again = run(plant, 20, fresh, begin=605.0)
     assert again[0][1].soc == pytest.approx(rows[-1][1].soc, abs=0.005)
@@ -207,7 +207,7 @@ def test_snapshot_over_a_restart():
 def test_charged_meanwhile_the_voltage_is_believed():
     estimator, _ = run(Plant(soc=0.3), 60)
     saved = estimator.snapshot("key")
-    fresh = Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+    fresh = EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
     fresh.restore(saved, "key", 30_000.0)
     _, rows = run(Plant(soc=0.95), 10, fresh)
     assert rows[0][1].soc == pytest.approx(0.95, abs=0.03)
@@ -229,7 +229,7 @@ def test_a_snapshot_that_does_not_fit_is_refused_whole(damage, message):
     estimator, _ = run(Plant(), 60)
     saved = estimator.snapshot("key")
     assert saved
-    fresh = Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+    fresh = EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
     before = fresh.snapshot("key"), fresh.forecaster.snapshot(), fresh.road
     with pytest.raises(ValueError, match=message):
         fresh.restore({**saved, **damage}, "key", 5.0)

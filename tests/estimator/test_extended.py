@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, EffectInputs, Ledger
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
+from tests.events import EventEstimator
 from tests.support import without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
@@ -25,8 +25,8 @@ def extended(*names: str, **values: float) -> Vehicle:
     return BASE.changed(BASE.parameters.joined(effects).replaced(**values), (*BASE.model.effects, *effects))
 
 
-def estimator(vehicle: Vehicle) -> Estimator:
-    return Estimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
+def estimator(vehicle: Vehicle) -> EventEstimator:
+    return EventEstimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
 
 
 def run(vehicle, seconds, change=lambda events: events, plant=None):

@@ -1,12 +1,12 @@
-"""Steps are made with the message of the pack, also where that comes seldom."""
+"""Speed and current of a step belong together, however often they come."""
 
 from __future__ import annotations
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 OFFSET, GAIN = VEHICLE.parameters["pack_current_offset"], VEHICLE.parameters["pack_current_gain"]
@@ -16,7 +16,7 @@ OFFSET, GAIN = VEHICLE.parameters["pack_current_offset"], VEHICLE.parameters["pa
 def test_a_step_has_the_pack_of_its_own_time(period):
     """A row of a table: all at one time, the voltage last. Speed and current of a step belong together."""
     groups = [Group(role, (role,), period) for role in ("vehicle_speed", "pack_current", "pack_voltage")]
-    e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for i in range(20):
         now = i * period
         for group, value in enumerate((5.0 + i * 0.1, OFFSET + GAIN * i, 54.0)):
@@ -25,29 +25,9 @@ def test_a_step_has_the_pack_of_its_own_time(period):
         assert e.estimate(now).speed == pytest.approx(5.0 + i * 0.1)
 
 
-@pytest.mark.parametrize("period", [0.1, 0.2, 0.5, 1.0, 2.0])
-@pytest.mark.parametrize("jitter", [0.0, 1e-7, 0.01])
-def test_a_row_is_one_step_whatever_comes_first_in_it(monkeypatch, period, jitter):
-    """Periods that the sender holds to a microsecond, too: none of the usual ones is between fast and slow."""
-    roles = "pack_current", "vehicle_speed", "inverter_current", "pack_voltage"
-    e = Estimator([Group(role, (role,), period) for role in roles], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
-    steps, step = [], e._step
-
-    def counted(now):
-        steps.append(now)
-        step(now)
-
-    monkeypatch.setattr(e, "_step", counted)
-    for i in range(200):
-        now = i * period + jitter * (i % 3)
-        for group, value in enumerate((OFFSET + GAIN * 5.0, 5.0, 5.0, 54.0)):
-            e.handle((now, group, (value,)))
-    assert len([time for time in steps if round(time / period) > 20]) == 179
-
-
 def test_without_the_pack_steps_are_made_all_the_same():
     groups = [Group(role, (role,), 0.5) for role in ("vehicle_speed", "pack_current", "pack_voltage")]
-    e = Estimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for i in range(40):
         for group, value in enumerate((5.0 + i * 0.1, 10.0, 54.0)):
             if group == 0 or i < 20:

@@ -16,7 +16,7 @@ from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck, vote
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import ROLES
+from gz_onboard.events import ROLES, RoleWindow
 
 RADIUS, GEAR = 0.25, 0.5  # m; wheel speed over motor speed
 STEP = 0.1  # s
@@ -56,11 +56,10 @@ def ridden(
             value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
             value = faults[role](t, value) if role in faults and value is not None else value
             if value is not None:
-                signal = signals[role]
-                signal.value, signal.time, signal.total, signal.count = value, t, value, 1
+                signals[role].take(RoleWindow(t, value, 1, value))
         speeds.step(StepInputs(t, STEP, STEP, signals, None))
         each(t, signals, speeds)
-        signals.next_step()
+        signals.next_window()
     return speeds, signals
 
 

@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.road import RoadState, accelerated
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import ROLES
+from gz_onboard.events import ROLES, RoleWindow
 
 RADIUS = 0.2438
 
@@ -38,10 +38,9 @@ def drive(seconds, motion, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
         }
         for role, value in values.items():
             if role not in without and (role != "gps_altitude" or t < altitude_until):
-                signal = signals[role]
-                signal.value, signal.time, signal.total, signal.count = value, t, value, 1
+                signals[role].take(RoleWindow(t, value, 1, value))
         road.step(t, dt, signals, RADIUS, 1.0)
-        signals.next_step()
+        signals.next_window()
         before = (speed, grade, lean, yaw, altitude)
         rows.append((t, road.speed, road.grade, road.lean, road.yaw_rate, road.heading, grade, lean, yaw, heading))
     return road, rows
@@ -72,10 +71,9 @@ def test_a_gyro_with_a_large_offset_is_learned_at_rest():
     signals = Signals((role, 2.0) for role in ROLES)
     for step in range(1, 300):
         for role, value in (("motor_speed", 0.0), ("rate_x", 0.1), ("rate_z", -0.12), ("accel_y", 0.0)):
-            signal = signals[role]
-            signal.value, signal.time, signal.total, signal.count = value, step * 0.1, value, 1
+            signals[role].take(RoleWindow(step * 0.1, value, 1, value))
         road.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
-        signals.next_step()
+        signals.next_window()
     assert road.bias_x == pytest.approx(0.1, abs=0.005)
     assert road.bias_z == pytest.approx(-0.12, abs=0.005)
 

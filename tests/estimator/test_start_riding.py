@@ -7,13 +7,13 @@ from math import exp
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.soc import JOINED
 from gz_onboard.events import Group
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import read_vehicle
+from tests.events import EventEstimator
 
 
 def test_at_full_speed_the_polarisation_is_that_of_full_speed():
@@ -25,7 +25,7 @@ def test_at_full_speed_the_polarisation_is_that_of_full_speed():
         Group("Speed", ("vehicle_speed",), 0.1),
         Group("Cells", ("cell_temperature",), 1.0),
     ]
-    e = Estimator(groups, battery, model, vehicle.riding)
+    e = EventEstimator(groups, battery, model, vehicle.riding)
     speed, soc = 18.0, 0.6
     power = e.forecaster.load.power(e.forecaster.load.quantities(speed, 0.0, Conditions(17.0, 0.0)))
     reaction = Model(tuple(x for x in model.effects if x.name != "slow_relaxation"), model.parameters)
@@ -54,7 +54,7 @@ def test_a_series_resistance_that_r0_holds_already_does_not_hide_what_the_curren
     groups = [Group("Pack", ("pack_current", "pack_voltage"), 0.1), Group("Cells", ("cell_temperature",), 1.0)]
     effects = tuple(x for x in vehicle.model.effects if x.port is not Port.CELL_VOLTAGE)
     model = Model(effects, vehicle.model.parameters)
-    e = Estimator(groups, replace(cells, series_resistance=guessed), model, vehicle.riding)
+    e = EventEstimator(groups, replace(cells, series_resistance=guessed), model, vehicle.riding)
     for i in range(300):
         current = 40.0 if i // 20 % 2 else 5.0
         e.handle((i * 0.1, 1, (20.0,)))

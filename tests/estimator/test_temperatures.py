@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.physics.cooling import LumpedCooling
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 AMBIENT, CELLS, AMPERES, DT = 5.0, 12.0, 30.0, 0.1  # degC, degC, A, s
@@ -20,10 +20,10 @@ GROUPS = [
 ]
 
 
-def ridden(vehicle: Vehicle, seconds: float, cells: float = 60.0, air: float = 1e9) -> Estimator:
+def ridden(vehicle: Vehicle, seconds: float, cells: float = 60.0, air: float = 1e9) -> EventEstimator:
     """At a steady current at the voltage of the model; cells, air [s]: when their sensors fall silent."""
     battery, p = vehicle.pack, vehicle.parameters
-    e, soc, v1 = Estimator(GROUPS, battery, vehicle.model, vehicle.riding), 0.9, 0.0
+    e, soc, v1 = EventEstimator(GROUPS, battery, vehicle.model, vehicle.riding), 0.9, 0.0
     for step in range(round(seconds / DT)):
         t, current = step * DT, 0.5 if step < 30 else AMPERES
         cell = current / battery.cells_parallel

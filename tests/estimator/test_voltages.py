@@ -11,9 +11,9 @@ from random import Random
 
 import pytest
 
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Estimate, Event, Group, Reason
+from gz_onboard.events import Estimate, Group, Reason
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 BATTERY = VEHICLE.pack
@@ -57,7 +57,7 @@ def events(seconds: float, factor: float, lies: dict[str, Lie], begin: float) ->
 
 def ridden(seconds: float, factor: float, begin: float = 0.0, **lies: Lie) -> list[Estimate]:
     """An estimate each second."""
-    estimator = Estimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
+    estimator = EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
     made: list[Estimate] = []
     for event in events(seconds, factor, lies, begin):
         while event[0] >= len(made) + 1:

@@ -16,14 +16,14 @@ import pytest
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator import outlook
 from gz_onboard.estimator.attribution import Moment
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.weakest import BLOCK, CHARGE_SD, FEWEST, NAMES, PLACE, PROVEN, Block, Weakest
-from gz_onboard.events import Cause, Event, Group
+from gz_onboard.events import Cause, Group
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, EventEstimator, events_of
 from tests.plant.machine import SERIES
 from tests.plant.packs import STEP, Discharge, discharge
 from tests.plant.ride import Hidden
@@ -82,7 +82,7 @@ def heard(kind: Hidden, lie: Lie | None = None) -> Iterator[Event]:
 
 def ridden(kind: Hidden, until: float, lie: Lie | None = None, saved: dict[str, Any] | None = None) -> Any:
     """The estimator when the mean cell is at `until`."""
-    estimator = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    estimator = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     if saved:
         estimator.restore(json.loads(json.dumps(saved)), "key", None)
     pack = packs()[kind]
@@ -124,7 +124,7 @@ def drawn(kind: Hidden, since: float) -> float:
 def test_a_voltage_that_no_cell_has_is_dropped_and_counted(tmp_path: Path, raw: int, value: float | None, faults: int):
     codec = Codec(with_cell_voltages(tmp_path).mapping)
     frame = EPOCH, identifier("BMS_Cells"), raw.to_bytes(2, "little") + bytes(6), 0
-    ((_, group, values),) = codec.decode([frame])
+    ((_, group, values),) = events_of(codec, [frame])
     assert values[codec.groups[group].roles.index("lowest_cell_voltage")] == value
     assert sum(codec.faults.values()) == faults
 
@@ -155,7 +155,7 @@ def test_a_healthy_pack_has_none():
 
 
 def test_without_the_signal_nothing_is_known():
-    estimator: Any = Estimator(
+    estimator: Any = EventEstimator(
         [*BUS[:3], Group("Cells", BUS[3].roles[:2], 1.0)], VEHICLE.pack, VEHICLE.model, VEHICLE.riding
     )
     for time, group, values in heard(WEAK):
@@ -220,7 +220,7 @@ def test_a_flat_curve_shows_a_low_group_only_at_its_end():
 
 
 def test_a_charge_or_a_new_state_of_charge_begins_another_block():
-    estimator: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    estimator: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     blocks: list[Block] = []
     estimator.weakest.take = blocks.append
     charged = False
@@ -293,7 +293,7 @@ def test_a_signal_that_tells_the_truth_again_is_believed_again():
 def test_what_was_learned_survives_a_restart():
     before = at(WEAK, 0.2)
     saved = json.loads(json.dumps(before.snapshot("key")))
-    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     again.restore(saved, "key", 10.0)
     assert again.weakest.learned() == before.weakest.learned()
     assert again.battery.health.weakest == before.battery.health.weakest
@@ -303,7 +303,7 @@ def test_what_was_learned_survives_a_restart():
 def test_a_state_without_it_or_of_another_pack_has_none():
     saved = at(WEAK, 0.2).snapshot("key")
     del saved["learned"]["weakest"]
-    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     again.restore(saved, "key", 10.0)
     assert again.weakest.known.blocks == 0
     saved = at(WEAK, 0.2).snapshot("key")
@@ -330,7 +330,7 @@ def test_a_state_without_it_or_of_another_pack_has_none():
 def test_what_cannot_be_is_refused_whole(wrong: dict[str, Any]):
     saved = json.loads(json.dumps(at(WEAK, 0.2).snapshot("key")))
     saved["learned"]["weakest"]["known"] |= wrong
-    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     with pytest.raises(ValueError):
         again.restore(saved, "key", 10.0)
     assert again.weakest.known.blocks == 0

@@ -15,8 +15,8 @@ from typing import Any
 from gz_onboard import state
 from gz_onboard.bus.codec import Codec
 from gz_onboard.daemon.loop import Daemon
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Event, Group
+from gz_onboard.events import Group
+from tests.events import Event, EventEstimator, events_of
 from tests.hardening.report import Report
 from tests.support import S, Scooter, check_estimate, reference
 
@@ -83,7 +83,7 @@ def _ride(seconds: float, odometer: float) -> tuple[Event, ...]:
     for second in range(round(seconds)):
         way = odometer + 0.01 * second
         frames.append(scooter.frame("VCU_Odometer", frames[0][0] + second * S, VCU_Odometer=way))
-    return tuple(Codec(reference().mapping).decode(sorted(frames)))
+    return tuple(events_of(Codec(reference().mapping), sorted(frames)))
 
 
 @cache
@@ -91,9 +91,9 @@ def _groups() -> Sequence[Group]:
     return Codec(reference().mapping).groups
 
 
-def _estimator() -> Estimator:
+def _estimator() -> EventEstimator:
     vehicle = reference()
-    return Estimator(_groups(), vehicle.pack, vehicle.model, vehicle.riding)
+    return EventEstimator(_groups(), vehicle.pack, vehicle.model, vehicle.riding)
 
 
 def ride_on(snapshot: Mapping[str, Any], source: Random) -> None:

@@ -25,6 +25,7 @@ from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import Vehicle
+from tests.events import events_of
 from tests.hardening.report import Report
 from tests.support import EPOCH, MS, Run, S, check_sound, recorded, reference, sealed
 from tests.vehicles.test_other_vehicles import tlmoto_frames
@@ -198,7 +199,7 @@ class Watch:
         for frame in run.logged:
             if not frame[3] & TRANSMITTED:
                 before = latest.get(frame[1])
-                second.decode((frame,))
+                events_of(second, (frame,))
                 self.used += latest.get(frame[1]) is not before
         counted = sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING)
         counted += sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames + codec.copies

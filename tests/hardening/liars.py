@@ -15,9 +15,9 @@ from functools import cache
 from itertools import chain
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Estimate, Event, State
+from gz_onboard.events import Estimate, State
 from gz_onboard.recording.logs import read_frames
+from tests.events import Event, EventEstimator, events_of
 from tests.hardening.report import Report
 from tests.support import LOGS, reference
 
@@ -144,7 +144,7 @@ def faults() -> list[Fault]:
 @cache
 def _events() -> tuple[Codec, tuple[Event, ...]]:
     codec = Codec(reference().mapping)
-    return codec, tuple(chain.from_iterable(codec.decode(batch) for batch in read_frames(LOGS / f"{RIDE}.blf")))
+    return codec, tuple(chain.from_iterable(events_of(codec, batch) for batch in read_frames(LOGS / f"{RIDE}.blf")))
 
 
 def _spoilt(events: Sequence[Event], lies: Mapping[int, Sequence[tuple[int, Lie]]]) -> Iterator[Event]:
@@ -166,7 +166,7 @@ def ridden(fault: Fault | None) -> list[Estimate]:
         if any(role in own.roles for role in roles)
     }
     vehicle = reference()
-    estimator = Estimator(codec.groups, vehicle.pack, vehicle.model, vehicle.riding)
+    estimator = EventEstimator(codec.groups, vehicle.pack, vehicle.model, vehicle.riding)
     made: list[Estimate] = []
     for event in _spoilt(events, lies):
         while event[0] >= len(made) + 1:

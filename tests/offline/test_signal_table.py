@@ -20,6 +20,7 @@ from gz_onboard.offline.samples import Samples, open_ride, read_samples
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.logs import read_samples as logged_samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import events_of
 
 REFERENCE = read_vehicle("reference")
 TLMOTO = Path(__file__).resolve().parents[1] / "vehicles" / "tlmoto"
@@ -236,7 +237,7 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     head = [frame for _, batch in zip(range(25), read_frames(log), strict=False) for frame in batch]
     start, codec = head[0][0], Codec(REFERENCE.mapping)
     rows: dict[float, dict[str, float]] = {}
-    for time, group, values in codec.decode(head):
+    for time, group, values in events_of(codec, head):
         named = zip(codec.groups[group].roles, values, strict=True)
         rows.setdefault(time, {}).update({role: value for role, value in named if value is not None})
     from gz_onboard.events import ROLES as UNITS

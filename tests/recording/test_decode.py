@@ -20,6 +20,7 @@ from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_log
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import read_vehicle
+from tests.events import events_of
 from tests.polled import STEADY, exchange, kona, request
 from tests.support import EPOCH, LOGS, MS, S
 
@@ -32,7 +33,7 @@ LEFT = (*COUNTED, "wrong_lengths", "passed", "last_ns")
 def live(frames: Sequence[Frame], codec: Codec) -> dict[str, list[tuple[float, float]]]:
     """(time [s], value) by role, of the live codec."""
     found: dict[str, list[tuple[float, float]]] = {}
-    for time, group, values in codec.decode(frames):
+    for time, group, values in events_of(codec, frames):
         for role, value in zip(codec.groups[group].roles, values, strict=True):
             if value is not None:
                 found.setdefault(role, []).append((time, value))
@@ -156,9 +157,10 @@ def recordings(draw: st.DrawFn, lengths: list[int]) -> list[Frame]:
         frames.append((0, identifier, bytes(data), channel))
     start = draw(st.sampled_from([0, EPOCH, 2**62]))
     times = accumulate(
-        (draw(st.integers(0, 100 * MS) if draw(st.integers(0, 5)) else steps) for _ in frames), initial=start
+        (draw(st.integers(0, 100 * MS) if draw(st.integers(0, 5)) else steps) for _ in frames), initial=start + 100 * MS
     )
-    return [(min(max(time, 0), 2**63 - 1), *frame[1:]) for time, frame in zip(times, frames, strict=False)]
+    stamped = [(min(max(time, 0), 2**63 - 1), *frame[1:]) for time, frame in zip(times, frames, strict=False)]
+    return [(start, 0x7FF, b"", 0), (start + 100 * MS, 0x7FF, b"", 0), *stamped]
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +168,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("any")
 
 
-@settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(bus=buses(), data=st.data())
 def test_any_frames_of_any_layout(folder: Path, bus: tuple[str, str, list[int]], data: st.DataObject) -> None:
     dbc, vehicle, lengths = bus

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.events import Estimate
+from gz_onboard.events import WINDOW, Estimate
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.log_rows import estimate_row
 from gz_onboard.pipeline import Pipeline
@@ -25,7 +25,7 @@ from gz_onboard.vehicle import read_vehicle
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
 GOLDEN = Path(__file__).resolve().parent / "golden"
-EVERY = 100  # estimates, thus 10 s
+EVERY = round(10.0 / WINDOW)  # estimates, thus 10 s
 WORST = 5  # rows told for each field
 
 Row = Mapping[str, str]
@@ -111,7 +111,7 @@ def golden_file(log: Path) -> Path:
 
 
 def estimates(frames: FrameColumns, filter_name: str = "scalar") -> list[Estimate]:
-    """Every estimate, ten a second, that the pipeline of the reference scooter makes of the frames."""
+    """Every estimate that the pipeline of the reference scooter makes of the frames."""
     made: list[Estimate] = []
     feed(Pipeline(read_vehicle("reference"), filter_name=filter_name, observer=made.append), frames)
     return made

@@ -14,7 +14,7 @@ from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
 from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
@@ -25,6 +25,7 @@ from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle
+from tests.events import events_of
 from tests.support import ROOT, reference, ridden
 
 NONE = Dropouts(frames=0.0, gps_gap_every=0.0)
@@ -57,7 +58,7 @@ def estimated():
 def column(role, all_frames=None):
     """(times [s since the start], values) of a role as the codec decodes it."""
     codec = Codec(reference().mapping)
-    found = codec.decode(all_frames or frames())
+    found = events_of(codec, all_frames or frames())
     shift = ((all_frames or frames())[0][0] - START_NS) * 1e-9
     rows = [
         (time + shift, values[codec.groups[group].roles.index(role)])
@@ -92,7 +93,7 @@ def test_the_estimate_is_the_truth():
     assert abs(np.mean(errors)) < 0.05
     assert np.abs(errors).max() < 0.1
     assert last.consumption_factor == pytest.approx(1.0, abs=0.1)
-    energy = sum(e.pack_voltage * e.pack_current * 0.1 for e in run.estimates if e.pack_current is not None)
+    energy = sum(e.pack_voltage * e.pack_current * WINDOW for e in run.estimates if e.pack_current is not None)
     assert energy == pytest.approx(ride()[0].energy, rel=0.01)
 
 

@@ -19,10 +19,10 @@ from cantools.database.can.signal import Signal
 
 from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
-from gz_onboard.events import Event
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.estimator.life import CELLS, INVERTER, MOTOR, OTHERS, PACK, PERIOD
 from tests.estimator.life import Scooter as Ridden
+from tests.events import Event
 from tests.support import EPOCH, ROOT, S, Scooter, range_database
 from tests.vcan.paced import LARGEST, WAITING, packet
 from tests.vcan.support import Daemon, Running

@@ -21,12 +21,13 @@ import pytest
 from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
 from gz_onboard.bus.dbc import load_database
 from gz_onboard.bus.mapping import pgn, read_mapping
-from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Event, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import Event, events_of
 
 HERE = Path(__file__).parent
 MS = 1_000_000
@@ -73,7 +74,7 @@ def tlmoto_frames(time_ns: int, rpm: float, volts: float, amps: float) -> list[F
 
 def test_tlmoto_frames_of_its_layout():
     codec = Codec(vehicle("tlmoto").mapping)
-    found = values(codec, codec.decode(tlmoto_frames(1_049 * MS, 1200, 115.625, 41.25)))
+    found = values(codec, events_of(codec, tlmoto_frames(1_049 * MS, 1200, 115.625, 41.25)))
     assert {role: row[0][1] for role, row in found.items()} == {
         "pack_voltage": 115.625,
         "motor_temperature": 60.0,
@@ -90,7 +91,7 @@ def test_tlmoto_frames_of_its_layout():
 def test_tlmoto_cells_are_in_its_dbc():
     codec = Codec(vehicle("tlmoto").mapping)
     data = bytes([0, 0xCA, 0xD1, 0xD1, 0xD0, 0xD1, 0, 0])
-    assert codec.decode([(0, 51, data, 0)]) == []  # cell voltages play no role yet, but stand in the log
+    assert events_of(codec, [(0, 51, data, 0)]) == []  # cell voltages play no role yet, but stand in the log
     cells = list(codec.values(51, data).values())
     assert cells[0] is None  # not read by the BMS: 2.00 V is no voltage of a cell in use
     assert cells[1:] == pytest.approx([4.02, 4.09, 4.09, 4.08, 4.09])
@@ -138,7 +139,7 @@ def test_tlmoto_real_frames_against_what_others_decoded(session):
     folder = real("tlmoto_motostudent_kiro")
     codec = Codec(vehicle("tlmoto").mapping)
     frames = [frame for batch in read_frames(folder / f"{session}.candump.log") for frame in batch]
-    events = codec.decode(frames)
+    events = events_of(codec, frames)
     count, expected_events, faults = TLMOTO_SESSIONS[session]
     assert (codec.received, len(events), codec.faults) == (count, expected_events, faults)
     assert set(codec.unknown) == {0x0C, 0x32, 0x7B, 0x80}  # 12: voltages of the motor; 50, 123: nobody knows
@@ -218,7 +219,7 @@ def test_car_frames_of_its_layout():
         (0, 4, (1 | 60_500 << 1).to_bytes(4, "little"), 0),
         (0, 9, (1 | 590 << 1 | 1028 << 31).to_bytes(8, "little"), 0),
     ]
-    found = values(codec, codec.decode(frames))
+    found = values(codec, events_of(codec, frames))
     assert {role: [value for _, value in row] for role, row in found.items()} == {
         "gps_speed": [pytest.approx(12.345)],
         "gps_fix": [3.0, None],
@@ -255,7 +256,7 @@ def test_car_real_frames_as_by_cantools_with_the_makers_dbc(tmp_path, drive):
     count = 0
     for batch in read_frames(folder / f"{drive}.log.gz"):
         count += len(batch)
-        left, right = values(ours, ours.decode(batch)), values(theirs, theirs.decode(batch))
+        left, right = values(ours, events_of(ours, batch)), values(theirs, events_of(theirs, batch))
         truth.clear()
         for _, identifier, data, _ in batch:
             if message := by_id.get(identifier):
@@ -285,7 +286,7 @@ def test_truck_frames_of_its_layout():
         (0, 0x18FEF100 | EFF_FLAG, bytes.fromhex("F7005A"), 0),
         (0, 0x18F00E00 | EFF_FLAG, bytes.fromhex("821639C4FFFFFFFF"), 0),
     ]
-    found = values(codec, codec.decode(frames))
+    found = values(codec, events_of(codec, frames))
     assert [value for _, value in found["motor_speed"]] == [pytest.approx(0x1448 / 8 * RPM), None, None]
     assert [value for _, value in found["vehicle_speed"]] == [pytest.approx(90 / 3.6)]
     assert codec.faults == {
@@ -306,7 +307,7 @@ def test_truck_real_frames_as_by_cantools_with_another_dbc(drive, count, speeds)
     codec = Codec(vehicle("truck").mapping)
     compared: Counter[str] = Counter()
     for batch in read_frames(folder / f"{drive}.log.gz"):
-        found = values(codec, codec.decode(batch))
+        found = values(codec, events_of(codec, batch))
         for role, group, signal, factor in [
             ("motor_speed", 61444, "EngineSpeed", RPM),
             ("vehicle_speed", 65265, "WheelBasedVehicleSpeed", 1 / 3.6),
@@ -345,7 +346,7 @@ def test_real_frames_with_stamps_of_whole_seconds(tmp_path):
         text += f'{role} = {{ signal = "S{busiest[n // 8]}_{n % 8}", unit = "{ROLES[role]}" }}\n'
     (tmp_path / "v.toml").write_text(text)
     codec = Codec(read_mapping(Table.read(tmp_path / "v.toml")))
-    events = codec.decode(frames)
+    events = events_of(codec, frames)
     wanted = [frame for frame in frames if frame[1] in busiest]
     assert [tuple(int(v) for v in numbers if v is not None) for _, _, numbers in events] == [
         tuple(f[2]) for f in wanted

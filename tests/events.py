@@ -1,0 +1,61 @@
+"""Events, the samples of one message at one time, for tests that say what came when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeAlias
+
+from gz_onboard.bus.codec import Codec
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import WINDOW, Estimate, Frame, MessageWindow, RoleWindow
+
+Event: TypeAlias = tuple[float, int, tuple[float | None, ...]]
+"""(time [s], group, values in SI units)"""
+
+
+def events_of(codec: Codec, frames: Iterable[Frame]) -> list[Event]:
+    """The samples of `frames`, one by one."""
+    found: list[Event] = []
+    for frame in frames:
+        codec.decode((frame,))
+        for window in codec.windows():
+            values = tuple(None if role is None else role.value for role in window.roles)
+            found.append((window.time, window.group, values))
+    return found
+
+
+class EventEstimator(Estimator):
+    """Makes windows of events. An estimate is of all that came until then."""
+
+    _open: dict[int, list[Event]]
+    _end = float("-inf")
+
+    def handle(self, event: Event) -> None:
+        """Take an event, and make the step of the window before it."""
+        if event[0] > self._end:
+            self.close(self._end)
+            self._end = event[0] + WINDOW - 1e-3
+        self._open.setdefault(event[1], []).append(event)
+
+    def close(self, now: float) -> None:
+        """Make a step with what came since the last."""
+        windows = [self._window(group, events) for group, events in getattr(self, "_open", {}).items()]
+        self._open = {}
+        self.step(now, windows)
+
+    def estimate(self, now: float) -> Estimate:
+        """See `Estimator`."""
+        if getattr(self, "_open", None):
+            self._end = min(now, self._end)
+            self.close(self._end)
+        return super().estimate(now)
+
+    @staticmethod
+    def _window(group: int, events: list[Event]) -> MessageWindow:
+        roles = []
+        for column in zip(*(values for _, _, values in events), strict=True):
+            seen = [(event[0], value) for event, value in zip(events, column, strict=True) if value is not None]
+            values = [value for _, value in seen]
+            n = len(seen)
+            roles.append(RoleWindow(*seen[-1], n, sum(values) / n, sum(v * v for v in values) / n) if seen else None)
+        return MessageWindow(group, events[-1][0], len(events), tuple(roles))
