@@ -93,7 +93,7 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
 
 @dataclass(frozen=True)
 class OpenRide:
-    """A ride that is to be estimated. frames: without an earlier run's estimates."""
+    """A ride before its estimation. frames: without the range frames of an earlier run."""
 
     source: Path  # its log, or what its table is called
     vehicle: Vehicle  # with the mapping of the ride

@@ -87,7 +87,7 @@ def open_ride(
 ) -> tuple[BusMapping, FrameColumns]:
     """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
 
-    on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
+    on_damage: as of `read_frames`. Raises InputError for another file, for frames without times, and for a log of a
     vehicle without DBC files.
     """
     time = vehicle.mapping.time.name if vehicle.mapping.time else ""

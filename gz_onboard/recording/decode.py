@@ -1,7 +1,7 @@
-"""Decode recorded frames by columns: the same values, and the same counts of what was dropped, as the live codec gives.
+"""Decode recorded frames by columns, with the same values and fault counts as the live codec.
 
 The frames are grouped by channel and identifier, and each signal is extracted from all frames of its message at once.
-What is rare goes frame by frame through the live codec: answers to requests, and messages that come from more than one
+Rare cases go frame by frame through the live codec: answers to requests, and messages that come from more than one
 channel or sender, of which the codec chooses one.
 """
 
@@ -75,7 +75,7 @@ def decode_columns(frames: FrameColumns, codec: Codec) -> dict[str, Column]:
 
 
 def _by_place(frames: FrameColumns) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """(channel, identifier, rows in their order) of all places, in the order in which they are first heard."""
+    """Group the frames: (channel, identifier, rows in ascending order), in the order of their first frames."""
     places = frames.bus.astype(np.int64) << 32 | frames.identifier
     known = np.unique(places)
     number = np.searchsorted(known, places).astype(np.uint16 if len(known) < 1 << 16 else np.int64)
@@ -87,7 +87,7 @@ def _by_place(frames: FrameColumns) -> list[tuple[int, int, NDArray[np.int64]]]:
 
 
 def _handler(codec: Codec, channel: int, identifier: int) -> Handler:
-    """The codec's handler of the frames of a place, which decides where a message is taken from."""
+    """The codec's handler for frames from a place; the first call for a place lets the codec choose the origin."""
     return codec._handlers.setdefault(channel, {}).get(identifier) or codec._first_heard(channel, identifier)
 
 
@@ -98,7 +98,7 @@ def _decode_one_by_one(frames: FrameColumns, passed_ns: NDArray[np.int64], codec
 
     @cache
     def accumulators(identifier: int) -> list[Accumulator]:
-        """Those that frames with this identifier may add to."""
+        """The accumulators that frames with this identifier can add to."""
         message = codec.origins.message(identifier)
         names = [r.name for r in codec.mapping.requests if r.response == identifier]
         names += [message.name] if message else []
@@ -133,7 +133,7 @@ def _layout(message: Message, mapping: BusMapping) -> MappedMessage | None:
 
 
 def _pager(message: Message, signal: Signal) -> Signal | None:
-    """The multiplexer of a signal; None of one that is in every frame."""
+    """The multiplexer of a signal; None if every frame has the signal."""
     if signal.multiplexer_ids is None or not signal.multiplexer_signal:
         return None
     return message.get_signal_by_name(signal.multiplexer_signal)

@@ -42,7 +42,7 @@ def _refuse_table(_data: Contents, damage: LogDamage) -> FrameColumns:
 
 
 def _python_can(suffix: str) -> Reader:
-    """The reader of a format that python-can reads, which is imported when it is needed."""
+    """A reader that imports python-can on first use, which takes 0.1 s."""
 
     def read(data: Contents, damage: LogDamage) -> FrameColumns:
         from gz_onboard.recording.readers import python_can
@@ -97,7 +97,7 @@ def read_log(
     end_ns: int | None = None,
     on_damage: Callable[[LogDamage], None] | None = None,
 ) -> FrameColumns:
-    """Read the frames of a log, in the order in which they stand in it.
+    """Read the frames of a log, in the order of the file.
 
     start_ns, end_ns: only frames with start_ns <= time < end_ns [ns since the epoch, as in the log]. on_damage is
     called once if something could not be read; without it a warning is logged. Raises InputError for a file that is
@@ -160,7 +160,7 @@ def is_table(path: Path, time: str = "") -> bool:
 
 
 def _head(path: Path) -> bytes:
-    """The first bytes of a file, unpacked; none of one that cannot be read."""
+    """The first bytes of a file, unpacked; empty if the file cannot be read."""
     head = b""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(_HEAD)
@@ -214,7 +214,7 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
 
 
 def _expanded(path: Path) -> list[Path]:
-    """The files that a pattern stands for, or the path itself."""
+    """The files that match a pattern, or the path itself."""
     if any(letter in str(path) for letter in "*?[") and not path.exists():
         try:
             found = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
@@ -232,12 +232,12 @@ def log_stem(log: Path) -> str:
 
 
 def _suffixes() -> str:
-    """Of logs, for messages."""
+    """The suffixes of logs, for messages."""
     return ", ".join(name for name in _READERS if name.startswith("."))
 
 
 def _may_be_table(file: Path) -> bool:
-    """By its name: a text of any kind may look like one."""
+    """Whether the name allows a table; the content of any text may look like one."""
     return file.name.lower().removesuffix(".gz").endswith((".csv", ".txt", ".parquet"))
 
 
@@ -275,10 +275,10 @@ def read_samples(
     end_ns: int | None = None,
     on_damage: Callable[[LogDamage], None] | None = None,
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
+    """Yield topic, time [ns] and values of each sample in one of our own logs, in the order of the file.
 
-    start_ns, end_ns, on_damage: as of `read_log`; without on_damage damage is passed over, for one who reads the frames
-    too.
+    Logs in other formats have no samples. start_ns, end_ns, on_damage: see `read_log`; without on_damage nothing is
+    reported, because reading the frames of the same log reports the damage.
     """
     damage = LogDamage(Path(path))
     own = _own(damage)
@@ -297,7 +297,7 @@ def read_samples(
 
 
 def _own(damage: LogDamage) -> mcap.LogContents | None:
-    """A log in our own format; None of another. InputError for one that is not there."""
+    """Open a log in our own format; None if it has another. Raises InputError for a missing file."""
     form, data = log_suffix(damage.path), _load(damage.path)
     return mcap.LogContents(unpacked(data, damage), damage) if form == ".mcap" else None
 
@@ -317,7 +317,7 @@ def _load(path: Path) -> Contents:
 
 
 def _problem(frame: Frame) -> str:
-    """Why no bus carries a frame."""
+    """The reason why no bus carries this frame."""
     time_ns, identifier, data, _ = frame
     if time_ns < 0:
         return f"{time_ns} ns is no time"

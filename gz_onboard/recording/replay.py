@@ -46,7 +46,7 @@ _PROGRESS_NS = 500_000_000
 
 @dataclass
 class Sent:
-    """What was sent: numbers of frames, time it took [s], and how late the latest frame was [s]."""
+    """Numbers of frames sent, the time it took [s], and the greatest delay of a frame [s]."""
 
     sent: int = 0
     failed: int = 0
@@ -218,7 +218,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _parts(arguments: argparse.Namespace, damages: list[LogDamage]) -> list[tuple[Path, FrameColumns]]:
-    """What is sent, of each log; InputError for one that is missing, which comes before what is wrong with the bus."""
+    """Read the frames to be sent of each log, before the bus is opened. Raises InputError for a missing log."""
     logs = logs_among([arguments.log])
     if len(logs) > 1 and (arguments.start or arguments.end is not None):
         raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
@@ -245,7 +245,7 @@ def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | 
 
 
 def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
-    """Without error frames, which no host can send, and what is not for the channels at hand."""
+    """Leave out error frames, which no host can send, and frames of further channels."""
     sendable = frames.identifier & ERR_FLAG == 0
     return frames[sendable if channels == 1 else sendable & (frames.bus < channels)]
 

@@ -14,11 +14,11 @@ _LEAST_WINDOW, _MOST_WINDOW = 16, 1 << 16  # frames that are looked at together
 
 
 def stray(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask of the frames whose time is ahead of all others: a few that stand alone do not move time.
+    """Mask of the few frames whose time is ahead of all others.
 
-    The frames that follow tell. A frame after a gap waits for the next ones. If `CONFIRM` in a row agree, it was a gap;
-    if one goes on where the frames before it were, the time of those that wait is wrong. Longer leaps, and those back,
-    are for `on_timeline`. On a live bus, where nobody can wait, the codec takes such a frame for a gap.
+    A frame after a gap waits for the next ones. If `CONFIRM` frames in a row agree, there was a gap; if one continues
+    from before the gap, the time of the waiting frames is wrong. Longer leaps, and leaps back, are left to
+    `on_timeline`. On a live bus, where nobody can wait, the codec takes such a frame for a gap.
     """
     found = np.zeros(len(time_ns), bool)
     waiting: list[int] = []  # places of frames after a gap, which the next ones confirm or refute
@@ -57,7 +57,7 @@ def stray(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(places of the frames whose time is plausible, their time on the codec's timeline [ns]).
+    """Find the frames with a plausible time: (their indices, their times on the codec's timeline [ns]).
 
     The codec judges each time that does not follow the one before, and is left at the time of the last frame.
     """
@@ -79,10 +79,10 @@ def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.in
 
 
 def _follow(time_ns: NDArray[np.int64], place: int, last: int, ahead_ns: int) -> tuple[int, int, int]:
-    """(place of the first frame that does not follow, latest time before it [ns], frames that do) from `place` on.
+    """Pass over frames that follow each other: (index of the first that does not, latest time before it [ns], count).
 
-    A frame follows if its time is from `BACK_NS` before the latest time so far, which begins with `last`, to `ahead_ns`
-    after it.
+    Begins at index `place`. A frame follows if its time is from `BACK_NS` before the latest time so far, which begins
+    with `last`, to `ahead_ns` after it.
     """
     begin, window = place, _LEAST_WINDOW
     while place < len(time_ns):

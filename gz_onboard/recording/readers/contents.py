@@ -1,4 +1,4 @@
-"""The contents of a log, and a note of what is damaged in it."""
+"""Contents of log files and the damage found in them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UNPACKED_AT_ONCE = 1 << 20  # bytes
 
 @dataclass
 class LogDamage:
-    """What could not be read of a log: how many pieces (lines, objects, chunks), and the first of them."""
+    """Count of the pieces of a log (lines, objects, chunks) that could not be read; place and reason of the first."""
 
     path: Path
     count: int = 0

@@ -57,7 +57,7 @@ class Message:
 
 
 class LogContents:
-    """What one of our logs holds besides its messages, which `messages` reads. Broken records are noted as damage.
+    """One of our logs: its declarations and attachments; `messages` reads the rest. Broken records are damage.
 
     Raises InputError for a file that is no MCAP.
     """
@@ -95,7 +95,7 @@ class LogContents:
                 self._damage.add(f"byte {start}", f"a chunk is broken ({error})")
 
     def _take(self, opcode: int, data: Contents, start: int, end: int) -> None:
-        """Take what a record tells that is neither a chunk nor a message."""
+        """Store a record that is neither a chunk nor a message."""
         if opcode not in _PARSERS:
             return
         try:

@@ -33,7 +33,7 @@ _BROKEN_LINE = (ValueError, LookupError, TypeError, AttributeError, NotImplement
 
 
 class _TraceReader(can.TRCReader):
-    """python-can's reader of PCAN traces; raises for a line that is none instead of logging it."""
+    """python-can's reader of PCAN traces; raises for a damaged line instead of logging it."""
 
     def _parse_line(self, line: str) -> can.Message | None:
         if not line:
@@ -44,7 +44,7 @@ class _TraceReader(can.TRCReader):
 
 
 class _LineFile:
-    """One line as a file of python-can's readers. It stands there twice, for they take the first for a header."""
+    """A file of one line, given twice, for python-can's readers, which take the first line for a header."""
 
     name = ""
 
@@ -58,7 +58,7 @@ class _LineFile:
         return next(self._lines)
 
     def close(self) -> None:
-        """Nothing is open; python-can closes what it reads."""
+        """Do nothing: python-can closes its file after each line."""
 
 
 def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
@@ -89,7 +89,7 @@ def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
 
 
 def _parser(reader: Any, suffix: str) -> Parser:
-    """Parse lines by one of python-can's readers, which keeps what the header says."""
+    """Parse lines by one of python-can's readers, which remembers the header."""
     channels = ChannelNumbers()
     header = _HEADERS.get(suffix, ())
 
@@ -171,7 +171,7 @@ def with_asammdf(path: Path) -> None:
 
 
 def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Frame:
-    """A python-can message as a frame; channels numbers the named channels (a name that it lacks raises KeyError).
+    """Convert a python-can message to a frame; `channels` maps named channels (KeyError for an unknown name).
 
     The time is rounded to a microsecond: the message's is a float of seconds, which has no more since 1970.
     """

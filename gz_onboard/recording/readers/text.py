@@ -77,7 +77,7 @@ def timed(frames: FrameColumns, damage: LogDamage) -> FrameColumns:
     """Turn the stamps of a text log into times.
 
     Stamps count since 1970, since an unknown start, or since the frame before; or there are none. The first frames tell
-    which; what is not since 1970 is said in a warning.
+    which; times that are not since 1970 cause a warning.
     """
     stamps = frames.time_ns
     first = stamps[:BATCH]
