@@ -52,8 +52,8 @@ deb-clean-root: setup  ## the package's life on a minimal Debian in a guest, fro
 .venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
 	@.ci/setup docs
 
-bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
-	$(PYTHON_IN_VENV) -m benchmarks.bench
+bench: setup  ## cost per frame, start-up, memory, next to the plain pipeline; rewrites docs/benchmarks.md (AGAINST=commit)
+	$(PYTHON_IN_VENV) -m benchmarks.bench --page docs/benchmarks.md $(if $(AGAINST),--against $(AGAINST))
 
 trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)

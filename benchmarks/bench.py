@@ -26,7 +26,9 @@ from statistics import median
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-RIDES = HERE.parent / "replay_logs"
+ROOT = HERE.parent
+RIDES = ROOT / "replay_logs"
+BEGIN, END = "<!-- figures: begin -->\n", "<!-- figures: end -->"  # around the table of the page
 RIDE, RIDE_2, SHORT_RIDE = RIDES / "city_14C.blf", RIDES / "city_34C.blf", RIDES / "coastdown.blf"
 SATURATED = 4000.0  # frames/s of 8 bytes and 11-bit identifiers at 500 kbit/s
 FILLERS = (0x300, 0x400, 0x401, 0x410, 0x411, 0x412)  # the fast messages without a counter that is checked
@@ -138,12 +140,17 @@ def bus() -> Iterator[tuple[list[str], socket.socket]]:
 
 
 @contextlib.contextmanager
-def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str], socket.socket, float]]:
-    """One of the pipelines once it is ready: its process, the socket to send on, its CPU time [s] until then."""
+def started(
+    which: str, directory: Path, root: Path = ROOT
+) -> Iterator[tuple[subprocess.Popen[str], socket.socket, float]]:
+    """One of the pipelines once it is ready: its process, the socket to send on, its CPU time [s] until then.
+
+    root: of the checkout that ours is run from.
+    """
     ours = ["gz_onboard", "run", "--channel", "vcan0", "--log-dir", str(directory), "--state-dir", str(directory)]
     plain = ["plain", "live", "vcan0", str(directory / "plain.mcap")]
     notify = directory / "notify"
-    environment = os.environ | {"NOTIFY_SOCKET": str(notify)}
+    environment = _environment(root) | {"NOTIFY_SOCKET": str(notify)}
     with bus() as (prefix, sender), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(str(notify))
         ready.settimeout(TIMEOUT)
@@ -165,9 +172,9 @@ def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str]
             process.wait()
 
 
-def run_live(which: str, frames: Send, live: Live) -> None:
+def run_live(which: str, frames: Send, live: Live, root: Path = ROOT) -> None:
     """Send `frames` in their timing to one of the pipelines and measure it meanwhile; adds to `live`."""
-    with tempfile.TemporaryDirectory() as name, started(which, Path(name)) as (process, sender, _):
+    with tempfile.TemporaryDirectory() as name, started(which, Path(name), root) as (process, sender, _):
         time.sleep(0.5)
         used: list[tuple[float, float]] = []
         begin = time.perf_counter()
@@ -197,21 +204,25 @@ def run_live(which: str, frames: Send, live: Live) -> None:
             live.log_bytes = sum(path.stat().st_size for path in Path(name).glob("*.mcap"))
 
 
-def compare_live(traffic: Callable[[float], Send], durations: Sequence[float]) -> tuple[Live, Live]:
-    """(ours, plain), run in turns: on a machine that does other things too, its speed changes from minute to minute."""
-    ours, plain = Live(), Live()
+def compare_live(
+    traffic: Callable[[float], Send], durations: Sequence[float], older: Path | None
+) -> tuple[Live, Live, Live | None]:
+    """(ours, plain, older), run in turns: on a machine that does other things too, its speed changes with time."""
+    ours, plain, before = Live(), Live(), Live()
     for seconds in durations:
         frames = traffic(seconds)
         run_live("ours", frames, ours)
         run_live("plain", frames, plain)
-    return ours, plain
+        if older:
+            run_live("ours", frames, before, older)
+    return ours, plain, before if older else None
 
 
-def start_up(which: str, repeats: int) -> float:
+def start_up(which: str, repeats: int, root: Path = ROOT) -> float:
     """CPU time [s] until ready, median."""
     values = []
     for _ in range(repeats):
-        with tempfile.TemporaryDirectory() as name, started(which, Path(name)) as (_process, _sender, used):
+        with tempfile.TemporaryDirectory() as name, started(which, Path(name), root) as (_process, _sender, used):
             values.append(used)
     return median(values)
 
@@ -219,7 +230,7 @@ def start_up(which: str, repeats: int) -> float:
 # --- offline ------------------------------------------------------------------------------------------------------
 
 
-def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
+def offline_ours(root: Path, rides: Sequence[Path], *options: str) -> tuple[float, float]:
     """CPU time [s] of the whole process and the length of the rides [s]."""
     with tempfile.TemporaryDirectory() as name:
         before = os.times()
@@ -234,16 +245,18 @@ def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
             "--json=-",
         ]
         command += [f"--output={name}", *options]
-        text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+        text = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=_environment(root), cwd=name
+        ).stdout
         after = os.times()
     used = after.children_user + after.children_system - before.children_user - before.children_system
     return used, sum(ride["duration_s"] for ride in json.loads(text)["rides"])
 
 
-def hour_ours(repeats: int, *options: str) -> float:
+def hour_ours(root: Path, repeats: int, *options: str) -> float:
     """CPU time [s] for a recorded hour: of a short ride, start-up included, and for the rest as of two longer ones."""
-    short = [offline_ours([SHORT_RIDE], *options) for _ in range(repeats)]
-    long = [offline_ours([RIDE, RIDE_2], *options) for _ in range(repeats)]
+    short = [offline_ours(root, [SHORT_RIDE], *options) for _ in range(repeats)]
+    long = [offline_ours(root, [RIDE, RIDE_2], *options) for _ in range(repeats)]
     cpu_0, cpu_1 = median(c for c, _ in short), median(c for c, _ in long)
     seconds_0, seconds_1 = short[0][1], long[0][1]
     return cpu_0 + (cpu_1 - cpu_0) / (seconds_1 - seconds_0) * (3600 - seconds_0)
@@ -331,93 +344,159 @@ def contents(log: Path) -> dict[str, float]:
     return sizes
 
 
-# --- simulation ---------------------------------------------------------------------------------------------------
+# --- parts --------------------------------------------------------------------------------------------------------
 
 
-def simulation(repeats: int) -> tuple[float, float]:
-    """CPU s of 20 minutes at 100 Hz: of the full scooter on WMTC class 1, and of the energy-only backward form."""
-    import numpy as np
+def cost(what: str, root: Path) -> dict[str, float]:
+    """Figures of `cost.py` by name, of the checkout in `root`."""
+    command = [sys.executable, str(HERE / "cost.py"), what]
+    text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=_environment(root)).stdout
+    return {str(name): float(value) for name, value in json.loads(text).items()}
 
-    from benchmarks.backward import RideConditions, backward
-    from gz_onboard.simulation.cycles import cycle
-    from gz_onboard.simulation.run import at_steps, drive, follow
-    from gz_onboard.simulation.scooter import STEP, Scooter
-    from gz_onboard.vehicle import read_vehicle
 
-    vehicle = read_vehicle("reference")
-    ridden = cycle("wmtc_class1")
-    forward_times, backward_times = [], []
-    for _ in range(repeats):
-        begin = time.process_time()
-        speeds = at_steps(ridden.time, ridden.speed, STEP)
-        drive(Scooter(vehicle, soc=0.95), follow(speeds, STEP), ridden.time[-1])
-        forward_times.append(time.process_time() - begin)
-    t = np.arange(0, 1200, 0.01)
-    v = np.maximum(0, 8 + 4 * np.sin(t / 13))
-    for _ in range(10 * repeats):
-        begin = time.process_time()
-        backward(vehicle, t, v, RideConditions(grade=0.02 * np.sin(t / 50)))
-        backward_times.append(time.process_time() - begin)
-    return median(forward_times), median(backward_times)
+def _environment(root: Path) -> dict[str, str]:
+    """The environment in which `root` is the package that Python imports, whatever is installed."""
+    return os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{HERE}"}
+
+
+@contextlib.contextmanager
+def checked_out(commit: str | None) -> Iterator[Path | None]:
+    """A checkout of an older commit in a temporary folder; None without one."""
+    if commit is None:
+        yield None
+        return
+    git = ["git", "-C", str(ROOT), "worktree"]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "older"
+        subprocess.run([*git, "add", "--quiet", "--detach", str(folder), commit], check=True)
+        try:
+            yield folder
+        finally:
+            subprocess.run([*git, "remove", "--force", str(folder)], check=True)
 
 
 # --- all ----------------------------------------------------------------------------------------------------------
 
 
+@dataclass
+class Table:
+    """Rows of figures, printed as they come."""
+
+    against: str | None
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def begin(self) -> None:
+        """Print the head."""
+        older = f"{self.against:>10}" if self.against else ""
+        print(f"{'':52} {'unit':8} {'ours':>9} {'plain':>9} {'plain/ours':>10} {older}  aim")
+
+    def row(
+        self,
+        what: str,
+        unit: str,
+        ours: float | None,
+        plain: float | None = None,
+        older: float | None = None,
+        aim: str = "",
+    ) -> None:
+        """Add a row; None: not measured, or that checkout has no such part."""
+        ratio = plain / ours if plain and ours and unit not in ("1", "%") else None
+        self.rows.append({"what": what, "unit": unit, "ours": ours, "plain": plain, "older": older, "aim": aim})
+        cells = [_cell(ours, 9), _cell(plain, 9), _cell(ratio, 10, 1), *([_cell(older, 10)] if self.against else [])]
+        print(f"{what:52} {unit:8} {' '.join(cells)}  {aim}", flush=True)
+
+    def markdown(self) -> list[str]:
+        """The table of docs/benchmarks.md."""
+        head = ["", "unit", "ours", "plain", "plain / ours", *([f"at {self.against}"] if self.against else []), "aim"]
+        lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+        for row in self.rows:
+            ours, plain = row["ours"], row["plain"]
+            ratio = f"{plain / ours:.1f}" if plain and ours and row["unit"] not in ("1", "%") else ""
+            cells = [row["what"].replace("  ", "– "), row["unit"], _cell(ours).strip(), _cell(plain).strip(), ratio]
+            cells += [_cell(row["older"]).strip()] if self.against else []
+            lines.append(f"| {' | '.join([*cells, row['aim']])} |")
+        return lines
+
+
+def _cell(value: float | None, width: int = 0, digits: int = 2) -> str:
+    return f"{'' if value is None else f'{value:.{digits}f}':>{width}}"
+
+
+def measure(table: Table, seconds: float, repeats: int, older: Path | None) -> None:
+    """All rows."""
+
+    def both(figure: Callable[[Path], float]) -> tuple[float, float | None]:
+        return figure(ROOT), figure(older) if older else None
+
+    for traffic, name, most, aim in (
+        (recorded, "as recorded", seconds, "ratio ≥ 5"),
+        (saturated, "saturated", 18.5, "ratio ≥ 7"),
+    ):
+        ours, plain, before = compare_live(
+            traffic, [min(seconds, most), *[min(seconds, 23.5, most)] * (repeats - 1)], older
+        )
+        figures: list[tuple[str, str, Callable[[Live], float], str]] = [
+            (f"live, {ours.rate:.0f} frames/s, {name}, with log", "µs/frame", lambda x: x.micros, aim),
+            ("  CPU of one processor", "%", lambda x: 100 * x.share, ""),
+            ("  frames lost", "%", lambda x: x.lost, ""),
+            ("  resident memory at the end", "MB", lambda x: x.memory, "< 40"),
+        ]
+        for what, unit, figure, aimed in figures:
+            table.row(what, unit, figure(ours), figure(plain), figure(before) if before else None, aimed)
+    now, then = both(lambda root: start_up("ours", repeats, root))
+    table.row("start-up until ready", "CPU s", now, start_up("plain", repeats), then, "< 0.25")
+
+    plain_hour, plain_bytes = hour_plain(repeats, 120.0)
+    now, then = both(lambda root: hour_ours(root, repeats))
+    table.row("estimate of a recorded hour", "CPU s", now, plain_hour, then, "ratio ≥ 10")
+    now, then = both(lambda root: hour_ours(root, repeats, "--frames", "--signals"))
+    table.row("  with the raw frames and signals logged", "CPU s", now, plain_hour, then)
+
+    for what, unit in (("pipeline", "µs/frame"), ("parts", "µs"), ("simulation", "CPU s")):
+        found, found_before = cost(what, ROOT), cost(what, older) if older else {}
+        for name in dict.fromkeys([*found, *found_before]):
+            table.row(name, unit, found.get(name), None, found_before.get(name))
+
+    with tempfile.TemporaryDirectory() as folder:
+        size, frames, shares = log_of_ride(Path(folder))
+    table.row("log of a whole recorded ride, all in", "B/frame", size / frames, plain_bytes, aim="≤ 13")
+    for part, held in sorted(shares.items(), key=lambda item: -item[1]):
+        table.row(f"  {part}", "B/frame", held / frames)
+
+
 def main() -> None:
-    """Measure all and print a table."""
+    """Measure all, print a table and write it into docs/benchmarks.md."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
     parser.add_argument("--seconds", type=float, default=63.0, help="of the longest live run (%(default)g)")
     parser.add_argument("--repeats", type=int, default=3, help="of each measurement (%(default)s)")
+    parser.add_argument("--against", metavar="COMMIT", help="measure an older commit in the same run, too")
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE", help="write the table into this page, such as docs/benchmarks.md"
+    )
     arguments = parser.parse_args()
-    os.environ["PYTHONPATH"] = f"{HERE.parent}{os.pathsep}{HERE}"  # this checkout, whatever is installed
+    os.environ["PYTHONPATH"] = f"{ROOT}{os.pathsep}{HERE}"  # this checkout, whatever is installed
     seconds, repeats = max(arguments.seconds, WARM_UP + 2 * WINDOW + 1), arguments.repeats
 
     where = "vcan0" if has_can() else "UDP sockets instead of CAN sockets, for both pipelines (benchmarks/stand_in.py)"
-    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
-    print(f"live frames over {where}\n")
-    rows: list[dict[str, object]] = []
-
-    def row(what: str, unit: str, ours: float, plain: float | None = None, aim: str = "") -> None:
-        rows.append({"what": what, "unit": unit, "ours": ours, "plain": plain, "aim": aim})
-        ratio = f"{plain / ours:10.1f}" if plain and ours and unit != "1" else ""
-        other = f"{plain:9.2f}" if plain is not None else ""
-        print(f"{what:52} {unit:8} {ours:9.2f} {other:9} {ratio:10}  {aim}", flush=True)
-
-    print(f"{'':52} {'unit':8} {'ours':>9} {'plain':>9} {'plain/ours':>10}  aim")
-    ours, plain = compare_live(recorded, [seconds, *[min(seconds, 23.5)] * (repeats - 1)])
-    row(f"live, {ours.rate:.0f} frames/s as recorded, with log", "µs/frame", ours.micros, plain.micros, "ratio ≥ 8")
-    row("  CPU of one processor", "%", 100 * ours.share, 100 * plain.share)
-    row("  frames lost", "%", ours.lost, plain.lost)
-    row("  resident memory at the end", "MB", ours.memory, plain.memory, "< 50")
-    row("  log, all in, of so short a ride", "B/frame", ours.log, plain.log)
-    ours, plain = compare_live(saturated, [min(seconds, 18.5)] * repeats)
-    row(f"live, {ours.rate:.0f} frames/s, saturated, with log", "µs/frame", ours.micros, plain.micros)
-    row("  CPU of one processor", "%", 100 * ours.share, 100 * plain.share)
-    row("  frames lost", "%", ours.lost, plain.lost)
-    row("start-up until ready", "CPU s", start_up("ours", repeats), start_up("plain", repeats), "< 0.8")
-
-    plain_hour, plain_bytes = hour_plain(repeats, 120.0)
-    plain_bare, _ = hour_plain(repeats, 120.0, "--no-frames")
-    ours_hour = hour_ours(repeats)
-    row("estimate of a recorded hour", "CPU s", ours_hour, plain_hour, "< 6, ratio ≥ 15")
-    row("  beside a plain pipeline that logs no frames", "CPU s", ours_hour, plain_bare)
-    row("  with the raw frames and signals logged", "CPU s", hour_ours(repeats, "--frames", "--signals"), plain_hour)
-    row("  real-time factor, ride over CPU time", "1", 3600 / ours_hour, 3600 / plain_hour)
-
-    forward, energy_only = simulation(repeats)
-    row("simulation of 20 minutes at 100 Hz", "CPU s", forward, aim="< 2")
-    row("  energy-only backward form", "CPU ms", 1000 * energy_only, aim="< 20")
-
-    with tempfile.TemporaryDirectory() as name:
-        size, frames, parts = log_of_ride(Path(name))
-    row("log of a whole recorded ride, all in", "B/frame", size / frames, plain_bytes, "≤ 13")
-    for part, held in sorted(parts.items(), key=lambda item: -item[1]):
-        row(f"  {part}", "B/frame", held / frames)
+    machine = f"Python {sys.version.split()[0]}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}"
+    print(f"{machine}\nlive frames over {where}\n")
+    table = Table(arguments.against)
+    table.begin()
+    with checked_out(arguments.against) as older:
+        measure(table, seconds, repeats, older)
     if arguments.json:
-        document = {"python": sys.version, "transport": where, "load": os.getloadavg(), "rows": rows}
+        document = {"python": sys.version, "transport": where, "load": os.getloadavg(), "rows": table.rows}
         arguments.json.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if arguments.page:
+        text = arguments.page.read_text(encoding="utf-8")
+        before, _, rest = text.partition(BEGIN)
+        _, _, after = rest.partition(END)
+        git = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+        commit = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+        made = f"Measured on commit {commit}. {machine}. Live frames over {where}."
+        lines = [BEGIN, made, "", *table.markdown(), "", END]
+        arguments.page.write_text(before + "\n".join(lines) + after, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -20,9 +20,8 @@ import numpy as np
 
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.constants import KELVIN, WH
-from gz_onboard.physics.derating import DeratingCurve
-from gz_onboard.physics.model import BASE_EFFECTS
-from gz_onboard.physics.tables import linear
+from gz_onboard.physics.effect import BASE_EFFECTS
+from gz_onboard.physics.functions import PiecewiseLinear, linear
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -186,9 +185,9 @@ def electric_braking(vehicle: Vehicle, **values: float) -> Vehicle:
 def unlimited(scooter: Scooter) -> Scooter:
     scooter.controller.derating = replace(
         scooter.controller.derating,
-        current_by_motor_speed=DeratingCurve((0.0,), (1.0,)),
-        regeneration_by_motor_speed=DeratingCurve((0.0, 0.5), (0.0, 1.0)),
-        regeneration_by_soc=DeratingCurve((0.0,), (1.0,)),
+        current_by_motor_speed=PiecewiseLinear((0.0,), (1.0,)),
+        regeneration_by_motor_speed=PiecewiseLinear((0.0, 0.5), (0.0, 1.0)),
+        regeneration_by_soc=PiecewiseLinear((0.0,), (1.0,)),
         regeneration_gain=1.0,
     )
     return scooter

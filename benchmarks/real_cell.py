@@ -29,9 +29,9 @@ from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effects import charge_transfer, slow_relaxation
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 
@@ -150,14 +150,15 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
     ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
-    battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
-    error, time = (result.curves[name] for name in ("battery.voltage_error", "voltage_error_time"))
+    battery = Battery(1, 1, capacity_25, PiecewiseLinear(temperature, share), 2.5, 0.0, *ocv_table, *circuit)
+    error, time = (
+        PiecewiseLinear(tuple(map(float, found.axes["temperature"])), tuple(map(float, found.value)))
+        for found in (result.curves["battery.voltage_error"], result.curves["voltage_error_time"])
+    )
     battery = replace(
         battery,
-        voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
-        voltage_error_value=tuple(map(float, error.value)),
-        voltage_error_time_temperature=tuple(map(float, time.axes["temperature"])),
-        voltage_error_time_value=tuple(map(float, time.value)),
+        voltage_error_curve=error,
+        voltage_error_time_curve=time,
         as_new=AS_NEW,
         capacity_sd=result.parameters["cell_capacity"].sd / capacity_25,
     )
@@ -165,8 +166,7 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         return battery
     return replace(
         battery,
-        rest_shift_temperature=temperature,
-        rest_shift_value=tuple(map(float, shift.value)),
+        rest_shift_curve=PiecewiseLinear(temperature, tuple(map(float, shift.value))),
         rest_shift_sd=float(np.median(shift.sd)),
     )
 
@@ -338,7 +338,7 @@ def settings(rest: Result, result: Result) -> list[Setting]:
 
 
 def _unshifted(battery: Battery) -> Battery:
-    return replace(battery, rest_shift_temperature=(), rest_shift_value=(), rest_shift_sd=0.0)
+    return replace(battery, rest_shift_curve=None, rest_shift_sd=0.0)
 
 
 def jobs(work: tuple[Setting, Cycle, Case]) -> Score:

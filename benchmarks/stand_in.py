@@ -2,7 +2,7 @@
 
     python benchmarks/stand_in.py RECEIVE_PORT SEND_PORT MODULE ARGUMENT...
 
-Only how python-can makes and binds its socket is replaced. Everything that the program then does with it is what it
+Only how the socket is made and bound is replaced, ours or python-can's. What the program then does with it is what it
 does on a real bus: `recvmsg` of 16-byte frames with the kernel's time stamps (SO_TIMESTAMPNS) and drop counter
 (SO_RXQ_OVFL), one queue in the kernel of the same bookkeeping, `send` of 16 bytes, `select`. What only AF_CAN knows
 (filters, loopback) is passed over: the frames sent here are all known to the vehicle.
@@ -10,12 +10,11 @@ does on a real bus: `recvmsg` of 16-byte frames with the kernel's time stamps (S
 
 from __future__ import annotations
 
+import importlib
 import runpy
 import socket
 import sys
 from typing import Any
-
-from gz_onboard.bus._can import can
 
 SOL_CAN_RAW = 101
 
@@ -29,9 +28,13 @@ class StandIn(socket.socket):
             super().setsockopt(level, *arguments)
 
 
-def install(receive_port: int, send_port: int) -> None:
-    """From now on python-can's socketcan bus receives on one port of 127.0.0.1 and sends to the other."""
-    from can.interfaces.socketcan import socketcan
+def install(receive_port: int, send_port: int, library: bool) -> None:
+    """From now on a SocketCAN bus receives on one port of 127.0.0.1 and sends to the other; library: python-can's."""
+    if library:
+        importlib.import_module("gz_onboard.bus._can")  # python-can without what makes it large
+        module = importlib.import_module("can.interfaces.socketcan.socketcan")
+    else:
+        module = importlib.import_module("gz_onboard.bus.socketcan")
 
     def create() -> socket.socket:
         return StandIn(socket.AF_INET, socket.SOCK_DGRAM)
@@ -40,13 +43,11 @@ def install(receive_port: int, send_port: int) -> None:
         sock.bind(("127.0.0.1", receive_port))
         sock.connect(("127.0.0.1", send_port))
 
-    socketcan.create_socket = create
-    socketcan.bind_socket = bind
+    for name, function in ("create_socket", create), ("bind_socket", bind):
+        setattr(module, name, function)
 
 
 if __name__ == "__main__":
-    assert can
-    install(int(sys.argv[1]), int(sys.argv[2]))
+    install(int(sys.argv[1]), int(sys.argv[2]), library=sys.argv[3] != "gz_onboard")
     del sys.argv[1:3]
-    module = sys.argv.pop(1)
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)

@@ -1,4 +1,4 @@
-"""Types of numpy arrays, for signatures (their docstrings give shape and unit), and what is often done with them."""
+"""Types of numpy arrays for signatures, whose docstrings give shape and unit, and common operations on arrays."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ Mask = NDArray[np.bool_]
 
 
 def block_means(values: Array, count: int) -> Array:
-    """Means over `count` values each, shape (len(values) // count,); what is left over at the end is not counted."""
+    """Means over `count` values each, shape (len(values) // count,); a shorter rest at the end is left out."""
     means: Array = values[: len(values) // count * count].reshape(-1, count).mean(axis=1)
     return means
 
@@ -40,7 +40,7 @@ def stretches(true: Mask | Sequence[bool]) -> list[tuple[int, int]]:
 
 
 def bends(nodes: Array) -> Array:
-    """(n - 2, n): what a line through its neighbours passes over each inner one of n `nodes` by, of values there."""
+    """Return a matrix (n - 2, n): a line through the neighbours minus the value, at each inner one of n `nodes`."""
     width = np.diff(nodes)
     share = width[1:] / (width[:-1] + width[1:])
     result = np.zeros((len(nodes) - 2, len(nodes)))

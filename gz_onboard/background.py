@@ -1,4 +1,4 @@
-"""Calls that may have to wait for a disk, on a thread of their own: an fsync to an SD card can take seconds."""
+"""Calls that may have to wait for a disk, on a separate thread: an fsync to an SD card can take seconds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ log = logging.getLogger("gz-onboard")
 
 
 class Background:
-    """Calls one after the other on a thread of its own; whoever asks for them never waits.
+    """Makes calls one after the other on a separate thread; the caller never waits.
 
-    limit: how much may wait, in the weights that `call` is given. An exception of a call is logged, and the next one
-    is made.
+    limit: how much may wait, in the weights that `call` is given. An exception is logged, and the next call is made.
     """
 
     def __init__(self, name: str, limit: int = 1) -> None:

@@ -10,7 +10,6 @@ import re
 import sys
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, NoReturn
 
 from gz_onboard import __version__
@@ -25,15 +24,14 @@ from gz_onboard.errors import (
     naming,
     nearest,
 )
-from gz_onboard.options import LOG_SUFFIXES
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
-    "learned": ("gz_onboard.daemon.learned", "show what the daemon has learned of battery and riding, or forget it"),
-    "route": ("gz_onboard.daemon.route", "give the running daemon the route that is to be ridden, or take it away"),
-    "dashboard": ("gz_onboard.dashboard.command", "show the range that the daemon sends, in a terminal or a browser"),
+    "learned": ("gz_onboard.daemon.learned", "show or reset what the daemon has learned of battery and riding"),
+    "route": ("gz_onboard.daemon.route", "give the running daemon a route, or clear it"),
+    "dashboard": ("gz_onboard.dashboard.command", "show the daemon's range in a terminal or a browser"),
     "mqtt": ("gz_onboard.bridges.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
-    "foxglove": ("gz_onboard.bridges.foxglove", "show the range that the daemon sends live in Foxglove"),
+    "foxglove": ("gz_onboard.bridges.foxglove", "show the daemon's range live in Foxglove"),
     "replay": ("gz_onboard.recording.replay", "send a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
     "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
@@ -55,13 +53,13 @@ COMMANDS = {
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """argparse's help, without the options in its first line: they are listed below."""
+    """Help without the options in the usage line, as they are listed below it."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=30)
 
     def _format_usage(self, usage: str | None, actions: Any, groups: Any, prefix: str | None) -> str:
-        # Of a command in a command argparse asks without options: that is how it is called.
+        # argparse asks for a subcommand's usage without its options.
         arguments = [action for action in actions if not action.option_strings]
         options = (
             [argparse.Action(["[OPTION ...]"], "", nargs=0, required=True)] if len(arguments) < len(actions) else []
@@ -70,13 +68,13 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse that names the nearest right option or command."""
+    """An argument parser whose errors name the nearest right option or command."""
 
     def __init__(self, *args: Any, **others: Any) -> None:
         super().__init__(*args, **{"formatter_class": _Help, **others})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """What a command does not know is its own error, with its own usage: argparse leaves it to the whole line's."""
+        """Report unknown arguments of a command with the usage of that command."""
         known, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -84,36 +82,23 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         if message.startswith("the following arguments are required: ") and self._subparsers:
-            self.print_help(sys.stderr)  # which commands there are is what is asked
+            self.print_help(sys.stderr)  # lists the commands
             self.exit(BAD_INPUT, f"\n{self.prog}: error: {message}\n")
         wrong, _, choices = message.partition("invalid choice: ")[2].partition(" (choose from ")
         if wrong:
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
-            words = message.split()[2:]
-            wrong = next((word for word in words if word.startswith("-")), "")
-            message += self._meant(wrong.partition("=")[0]) if wrong else self._place_of(words[0])
+            wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
+            bare = {option.lstrip("-"): option for option in self.known_options()}
+            near = closest(wrong.partition("=")[0].lstrip("-"), bare)  # the dashes that all have make none alike
+            if near:
+                message += f" (did you mean {bare[near]!r}?)"
+            elif not wrong and any(not action.option_strings for action in self._actions):
+                message += "; files go before the options"
         super().error(message)
 
-    def _meant(self, wrong: str) -> str:
-        """As `nearest`; dashes, which all options have, make none like another."""
-        bare = {option.lstrip("-"): option for option in self.known_options()}
-        near = closest(wrong.lstrip("-"), bare)
-        return f" (did you mean {bare[near]!r}?)" if near else ""
-
-    def _place_of(self, word: str) -> str:
-        """Where a file or folder `word` goes on the command line of this command."""
-        if any(not action.option_strings for action in self._actions):
-            return "; files go before the options"
-        named = ((str(action.metavar), action) for action in self._actions if action.help != argparse.SUPPRESS)
-        taking = [f"{action.option_strings[0]} {of}" for of, action in named if re.search("FILE|TOML|DIR", of)]
-        replayed = Path(word).is_dir() or word.lower().removesuffix(".gz").endswith(LOG_SUFFIXES)
-        ride = "; a recorded ride is for estimate, or for replay onto a bus" if replayed else ""
-        name = self.prog.partition(" ")[2]
-        return f"; {name} takes files and folders behind its options only: {', '.join(taking)}{ride}"
-
     def known_options(self) -> list[str]:
-        """The options of this command and of its subcommands, without their old names."""
+        """Options of this command and of its subcommands."""
         options: list[str] = []
         for action in self._actions:
             options += action.option_strings if action.help != argparse.SUPPRESS else []
@@ -124,7 +109,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def command_line(called: Collection[str]) -> argparse.ArgumentParser:
-    """The command line with the arguments of the commands `called`; the others' would only cost their import."""
+    """Return the parser, with the arguments of the commands `called` only: the others would cost their import."""
     statuses = "\n".join(f"  {status:<4} {text}" for status, text in EXIT_STATUSES.items())
     parser = _Parser(
         prog="gz-onboard",
@@ -142,10 +127,10 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line `argv`; gives the exit status: 0, or one of those in `errors`."""
-    # Our matrices are small, and large work runs in processes of its own: threads would only get in each other's way.
+    """Run the command line `argv` and return the exit status, see `EXIT_STATUSES`."""
+    # The matrices are small, and large work runs in several processes: threads would only compete.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files that are not UTF-8, or a terminal that has no ±
+    if isinstance(sys.stdout, io.TextIOWrapper):  # file names that are not UTF-8, or a terminal without ±
         sys.stdout.reconfigure(errors="replace")
     argv = list(sys.argv[1:] if argv is None else argv)
     called = next((word for word in argv if not word.startswith("-")), "")
@@ -158,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
-        _let_go()
+        _drop_output()
         return BAD_INPUT
     except ModuleNotFoundError as error:
         if not (missing := lacking_extra(error)):
@@ -172,12 +157,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except OSError as error:  # what is left is mostly a disk that is full
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
-        _let_go()
+        _drop_output()
         return FAILED
 
 
-def _let_go() -> None:
-    """Drop output that cannot be written: at its end the interpreter would try again, and give status 120 for ours."""
+def _drop_output() -> None:
+    """Drop output that cannot be written; the interpreter would try again at exit and return status 120."""
     if sys.stdout is None:
         return
     try:

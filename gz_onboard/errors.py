@@ -33,8 +33,8 @@ _SHORT.maxstring = _SHORT.maxother = 100
 class InputError(Exception):
     """A command line, file or parameter that cannot be used.
 
-    The message names the place (file, line, key), the value and its unit where it has one, and what would
-    be right. The command line prints it without a traceback and exits with status `BAD_INPUT`.
+    The message names the place (file, line, key), the value with its unit, and the values that would be
+    right. The command line prints it without a traceback and exits with status `BAD_INPUT`.
     """
 
 
@@ -82,14 +82,14 @@ def closest(name: str, known: Iterable[str], close: float | None = None) -> str 
 
 
 def near_file(file: Path) -> str:
-    """As `nearest`, of the files beside it, for a file that is not there."""
+    """As `nearest`, among the other files in its folder, for a file that is missing."""
     with suppress(OSError):
         return "" if file.exists() else nearest(file.name, (one.name for one in file.parent.iterdir()), CLOSE_FILE)
     return ""
 
 
 def unreadable(file: Path, error: Exception) -> InputError:
-    """That `file` cannot be read, what the operating system says of it, and what to do."""
+    """Return the error for a `file` that cannot be read, with the reason of the operating system and a hint."""
     if isinstance(error, IsADirectoryError):
         return InputError(f"{file}: is a folder; give the file in it")
     return InputError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}{near_file(file)}")
@@ -115,7 +115,7 @@ def writable(text: str) -> str:
 
 
 def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
-    """InputError if a file to be written is an input, or the ``rides.json`` beside one, or another output, or a folder.
+    """InputError if an output file is an input, the ``rides.json`` next to one, another output, or a folder.
 
     By whatever name. outputs: a name may be None, or ``-`` for standard output.
     """
@@ -158,7 +158,7 @@ def naming() -> Iterator[None]:
 
 @contextmanager
 def writing(place: object) -> Iterator[None]:
-    """InputError for what the operating system refuses within, naming the file, or else `place`.
+    """Turn an OSError within into an InputError that names the file, or else `place`.
 
     OSError where the fault is not the name's: a full disk, a broken one.
     """

@@ -1,4 +1,4 @@
-"""Positions as they stand in logs and go to Foxglove: its well-known schema of a satellite fix."""
+"""Positions in logs and live in Foxglove, by its well-known schema of a satellite fix."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LOCATION_SCHEMA: dict[str, Any] = {
 
 
 def location_row(time_ns: int, frame: str, latitude: float, longitude: float, altitude: float | None) -> dict[str, Any]:
-    """A position [deg, m] of `time_ns` as ``foxglove.LocationFix``; frame: what is there."""
+    """A position [deg, m] of `time_ns` as ``foxglove.LocationFix``; frame: name of the object."""
     row = {
         "timestamp": {"sec": time_ns // _NS, "nsec": time_ns % _NS},
         "frame_id": frame,

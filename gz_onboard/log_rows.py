@@ -1,4 +1,4 @@
-"""What stands in logs: topics, their schemas, and estimates and explanations as rows."""
+"""The contents of our logs: topics, their schemas, and estimates and explanations as rows."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
 
 
 class Log(Protocol):
-    """What the pipeline writes to; `gz_onboard.bus.logfile` and `recorder` have them."""
+    """A log that the pipeline writes to; implemented by `gz_onboard.bus.logfile` and `recorder`."""
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects."""
@@ -95,7 +95,7 @@ def reason_names(found: Reason) -> list[str]:
 
 
 def estimate_row(estimate: Estimate) -> dict[str, object]:
-    """An estimate as it stands in logs: SI units, state and reasons by name, None for what is not known."""
+    """Return an estimate as a row: SI units, state and reasons by name, None for unknown numbers."""
     row: dict[str, object] = {}
     for name in ESTIMATE_UNITS:
         value = getattr(estimate, name)
@@ -123,7 +123,7 @@ def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
 
 
 def explanation_row(why: Explanation) -> dict[str, object]:
-    """An explanation as it stands in logs: causes by name."""
+    """Return an explanation as a row: causes by name."""
     causes = {cause.name.lower(): size for cause, size in why.causes.items()}
     numbers = {"time": why.time, "reference": why.reference, "range": why.range} | causes
     row: dict[str, object] = {name: round(value, 2) for name, value in numbers.items()}
@@ -131,7 +131,7 @@ def explanation_row(why: Explanation) -> dict[str, object]:
 
 
 def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) -> dict[str, object]:
-    """What was ridden and drawn until the `last` estimate, as it stands in logs; ambient: [degC]."""
+    """Return distance and energy up to the `last` estimate as a row; ambient: [degC]."""
     return {
         "time": round(last.time, 3),
         "distance": round(last.distance, 2),
@@ -145,7 +145,7 @@ def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) ->
 
 
 def learned_row(learned: Mapping[str, Learned]) -> dict[str, dict[str, float]]:
-    """What was learned of the battery, as it stands in logs."""
+    """Return the learned battery as a row."""
     return {
         name: {"factor": round(x.value, 4), "sd": round(x.sd, 4), "share": round(x.share, 3)}
         for name, x in learned.items()

@@ -1,4 +1,4 @@
-"""What the daemon reports to systemd: ready, alive, what it is doing, stopping (sd_notify(3), sd_watchdog_enabled(3)).
+"""Reports to systemd: ready, alive, status, stopping (sd_notify(3), sd_watchdog_enabled(3)).
 
 Nothing happens where systemd does not listen: every function works the same in a terminal and in a test.
 """
@@ -50,7 +50,7 @@ def stopping(text: str = "", environ: Mapping[str, str] = os.environ) -> bool:
 
 
 def watchdog_interval(environ: Mapping[str, str] = os.environ) -> float | None:
-    """Seconds between two calls of `alive`: half of what the unit's WatchdogSec= allows; None without a watchdog.
+    """Seconds between two calls of `alive`: half of the unit's WatchdogSec=; None without a watchdog.
 
     A WATCHDOG_PID that is not ours means that the variables were meant for another process.
     """

@@ -1,4 +1,4 @@
-"""The options that several commands have: one name, help, type, default and range for each."""
+"""Options that several commands share: one name, help, type, default and range for each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FILTERS = ("scalar", "filterpy")
 def number(
     option: str, low: float, high: float, unit: str = "", *, kind: type[float] = float, counted: str = ""
 ) -> Callable[[str], float]:
-    """A type for argparse: a number from `low` to `high`, else InputError. counted: what the range is a number of."""
+    """Return a type for argparse: a number from `low` to `high`, else InputError. counted: the plural it counts."""
 
     def parse(text: str) -> float:
         value = kind(text)

@@ -1,4 +1,4 @@
-"""How far a command is, as a bar on standard error; nothing where that is no terminal."""
+"""A progress bar on standard error, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ Progress = Callable[[float], None]
 
 
 class Display:
-    """What is shown of the progress; without a bar only `print` does something."""
+    """The display of progress; without a bar only `print` has an effect."""
 
     def __init__(self, bar: Any = None) -> None:
         self._bar = bar
 
     def update(self, work: float) -> None:
-        """Count work that was done."""
+        """Add finished work."""
         if self._bar is not None:
             self._bar.update(work)
 
     def step(self, text: str, work: float = 0.0) -> None:
-        """Name the step that begins, and count work."""
+        """Name the next step, and add finished work."""
         if self._bar is not None:
             self._bar.set_description_str(text)
             self._bar.update(work)
@@ -38,7 +38,7 @@ class Display:
 
 @contextmanager
 def progress_bar(total: Callable[[], float | None], unit: str = "", *, quiet: bool = False) -> Iterator[Display]:
-    """A display of the progress, for as long as the context lasts.
+    """Display progress while the context lasts.
 
     total: all the work in `unit`, or None if it is not known; called for the bar only. Without a `unit` the bar shows
     a percentage, without total and unit the step that runs.

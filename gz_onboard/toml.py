@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Collection, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,117 +16,79 @@ from gz_onboard.errors import LONGEST_NAME, InputError, nearest, shown
 LARGEST_FILE = 1_000_000  # bytes; that of the reference scooter has 20 000
 LONGEST_LIST = 1000
 LONGEST_PATH = 200  # letters, of up to four bytes: no file system takes much more
-MOST_PARTS = 10  # of a key or header; the time to read one grows with their square, and four are the most in use
 FEW = 30  # names that a message lists
 
-_HEADER = re.compile(r"^[ \t]*\[\[?[ \t]*[A-Za-z_\"']", re.M)  # not a row of a list of numbers
-_STRING = r'"(?:[^"\\\n]|\\.)*+"?|\'[^\'\n]*+\'?'  # on one line; each takes all there is where its end is missing
-_TOKEN = re.compile(
-    rf"(?P<deep>(?:(?:[\w-]++|{_STRING})[ \t]*\.[ \t]*){{{MOST_PARTS}}})"
-    rf'|"""(?:[^\\]|\\.)*?(?:"{{3,5}}|\Z)|\'\'\'.*?(?:\'{{3,5}}|\Z)|{_STRING}|#[^\n]*|[\w-]+',
-    re.S,
-)
+_HEADER = re.compile(r"[ \t]*(\[\[?)[ \t]*([A-Za-z_\"'][^\[\],]*)\]+[ \t]*(?:#.*)?$")
+_KEY = re.compile(r"[ \t]*([\w\"'-][\w\"'. \t-]{0,200})=")
+# The time to read a key grows with the square of its parts; four are the most in use.
+_DEEP_KEY = re.compile(r"(?:[\w-]++[ \t]*+\.[ \t]*+){20}")
 
 
-def _quoted(name: str) -> str:
-    return rf"[\"']?{re.escape(name)}[\"']?"
-
-
-def _dotted(path: list[str]) -> str:
-    return r"[ \t]*\.[ \t]*".join(map(_quoted, path))
+SMALLEST_STEP = 1e-6
 
 
 class Table:
-    """A TOML table that knows where it stands, so that every complaint can say so."""
+    """A TOML table that knows its place in the file, for error messages.
 
-    def __init__(self, values: Mapping[str, Any], file: Path, text: str, name: str = "") -> None:
+    lines: line numbers by path; path: that of this table, with an index for one of an array of tables.
+    """
+
+    def __init__(self, values: Mapping[str, Any], file: Path, lines: Mapping[str, int], path: str = "") -> None:
         self.values = values
         self.file = file
-        self.name = name
-        self._text = text
+        self.name = ".".join(part for part in path.split(".") if not part.isdigit())
+        self._lines = lines
+        self._path = path
 
     @classmethod
     def read(cls, file: Path) -> Table:
-        """Read `file`; InputError if it is missing, larger than `LARGEST_FILE`, or not TOML."""
+        """Read `file`. InputError if it is missing, larger than `LARGEST_FILE`, or not TOML."""
         text = read_text(file, LARGEST_FILE)
-        if deep := next((token for token in _TOKEN.finditer(text) if token["deep"]), None):
+        if deep := _DEEP_KEY.search(text):
             line = text.count("\n", 0, deep.start()) + 1
-            raise InputError(f"{file}:{line}: {shown(deep[0])}: a key has at most {MOST_PARTS} parts")
+            raise InputError(f"{file}:{line}: {shown(deep[0])}: this key has too many parts")
         try:
-            return cls(tomllib.loads(text), file, text)
+            return cls(tomllib.loads(text), file, _line_numbers(text))
         except ValueError as error:  # not TOML, or a number of thousands of digits
             raise InputError(f"{file}: not valid TOML: {error}") from error
         except RecursionError as error:
-            raise InputError(f"{file}: not valid TOML: brackets in brackets without end") from error
+            raise InputError(f"{file}: not valid TOML: brackets are nested too deeply") from error
 
     def error(self, message: str, key: str = "") -> InputError:
-        """The error to raise about `key` (or about the table as a whole)."""
-        line = self._line(key)
-        place = f"{self.file}:{line}" if line else str(self.file)
+        """Return the error to raise about `key`, or about the table as a whole."""
+        path = _joined(self._path, key)
+        while path and path not in self._lines:  # a key that is missing, or in an inline table
+            path = path.rpartition(".")[0]
+        place = f"{self.file}:{self._lines[path]}" if path else str(self.file)
         inside = ".".join(part[:LONGEST_NAME] for part in (self.name, key) if part)
         return InputError(f"{place}: {inside}: {message}" if inside else f"{place}: {message}")
 
-    def _line(self, key: str) -> int | None:
-        """The line on which `key` of this table stands, or else the table; None if a search cannot tell."""
-        path = [part for part in (*self.name.split("."), key) if part]
-        if path and (header := self._header(path)):
-            return self._number(header.start())
-        fallback = None
-        for depth in range(len(path) - 1, -1, -1):  # the key may stand in an inline table or behind dots
-            header = self._header(path[:depth]) if depth else None
-            if depth and not header:
-                continue
-            begin = header.end() if header else 0
-            following = _HEADER.search(self._text, begin)
-            found = re.compile(rf"^[ \t]*{_quoted(path[depth])}[ \t]*[=.]", re.M).search(
-                self._text, begin, following.start() if following else len(self._text)
-            )
-            if found:
-                return self._number(found.start())
-            fallback = fallback or header
-        inner = re.search(rf"^[ \t]*\[+[ \t]*{_dotted(path)}[ \t]*\.", self._text, re.M)
-        found = inner or fallback
-        return self._number(found.start()) if found else None
-
-    def _header(self, path: list[str]) -> re.Match[str] | None:
-        return re.search(rf"^[ \t]*\[+[ \t]*{_dotted(path)}[ \t]*\]", self._text, re.M)
-
-    def _number(self, position: int) -> int:
-        return self._text.count("\n", 0, position) + 1
-
     def only(self, known: Collection[str]) -> None:
-        """Refuse keys that are not in `known`."""
+        """InputError for a key that is not in `known`."""
         for key in self.values:
             if key not in known:
                 there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
                 raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
 
     def table(self, key: str) -> Table:
-        """The sub-table `key`; an empty one if it is not there."""
+        """Return the sub-table `key`; an empty one if it is missing."""
         value = self.values.get(key, {})
         if not isinstance(value, Mapping):
             raise self.error(f"must be a table, is {shown(value)}", key)
-        return Table(value, self.file, self._text, f"{self.name}.{key}" if self.name else key)
+        return Table(value, self.file, self._lines, _joined(self._path, key))
 
     def tables(self, key: str, most: int) -> list[Table]:
-        """The tables of the array `key`, ``[[key]]``, at most `most`; none if it is not there."""
+        """Return the tables of the array ``[[key]]``, at most `most`; none if it is missing."""
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(one, Mapping) for one in value):
             raise self.error(f"must be tables under headers [[{key}]], is {shown(value)}", key)
         if len(value) > most:
             raise self.error(f"there are {len(value)}, the most are {most}", key)
-        name = f"{self.name}.{key}" if self.name else key
-        header = re.compile(rf"^[ \t]*\[\[[ \t]*{_dotted(name.split('.'))}[ \t]*\]\]", re.M)
-        begins = [found.start() for found in header.finditer(self._text)]
-        if len(begins) != len(value):  # written in one line
-            return [Table(one, self.file, self._text, name) for one in value]
-        ends = [*begins, len(self._text)][1:]
-        # Of the text before it only the lines are left: its keys are found where they stand, not in another's.
-        texts = ["\n" * self._text.count("\n", 0, i) + self._text[i:k] for i, k in zip(begins, ends, strict=True)]
-        return [Table(one, self.file, text, name) for one, text in zip(value, texts, strict=True)]
+        path = _joined(self._path, key)
+        return [Table(one, self.file, self._lines, f"{path}.{i}") for i, one in enumerate(value)]
 
     def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
-        """The string `key`, one of `choices` if these are given."""
+        """Return the string `key`, one of `choices` if any are given."""
         value = self.values.get(key, default)
         if not isinstance(value, str):
             raise self.error("is missing" if value is None else f"must be a string, is {shown(value)}", key)
@@ -133,7 +97,7 @@ class Table:
         return value
 
     def texts(self, key: str, what: str) -> list[str]:
-        """The list of strings `key`, at least one, at most `LONGEST_LIST`; `what` they are, for the complaint."""
+        """Return the list of strings `key`, 1 to `LONGEST_LIST`; `what` they are, for the message."""
         complaint = f"must be a list of {what}, is {shown(self.values.get(key))}"
         texts = self._list(key, complaint)
         if not all(isinstance(text, str) for text in texts):
@@ -141,32 +105,46 @@ class Table:
         return texts
 
     def check_path(self, key: str, text: str) -> str:
-        """`text`, of the value `key`, if the system takes it for a path; InputError."""
+        """Return `text`, the value of `key`. InputError if it cannot be a path."""
         if not text or len(text) > LONGEST_PATH or not text.isprintable():
             raise self.error(f"{shown(text)} cannot be the name of a file", key)
         return text
 
     def number(self, key: str, default: float | None = None, low: float = -1e300, high: float = 1e300) -> float:
-        """The number `key`, within [low, high]."""
+        """Return the number `key`, within [low, high]."""
         value = self.values.get(key, default)
         if value is None:
             raise self.error("is missing", key)
         return self._number_of(value, key, low, high)
 
     def integer(self, key: str, low: int, high: int) -> int:
-        """The whole number `key`, within [low, high]."""
+        """Return the whole number `key`, within [low, high]."""
         value = self.number(key, low=low, high=high)
         if value != int(value):
             raise self.error(f"must be a whole number, is {value:g}", key)
         return int(value)
 
     def numbers(self, key: str, low: float = -1e300, high: float = 1e300) -> tuple[float, ...]:
-        """The list of numbers `key`, each within [low, high]; at least one, at most `LONGEST_LIST`."""
+        """Return the list of numbers `key`, each within [low, high]; 1 to `LONGEST_LIST`."""
         numbers = self._list(key, f"must be a list of numbers, 1 to {LONGEST_LIST}")
         return tuple(self._number_of(number, key, low, high) for number in numbers)
 
+    def increasing(self, key: str, low: float, high: float, unit: str = "") -> tuple[float, ...]:
+        """The list of increasing numbers `key` in `unit`, each within [low, high].
+
+        Steps are `SMALLEST_STEP` or more: a slope over them must stay a number.
+        """
+        row, of = self.numbers(key), f" {unit}" if unit else ""
+        for x in row:
+            if not low <= x <= high:
+                raise self.error(f"{x:g}{of} is outside {low:g} to {high:g}{of}", key)
+        for a, b in pairwise(row):
+            if b - a < SMALLEST_STEP:
+                raise self.error(f"must increase, but {b:g}{of} follows {a:g}{of}", key)
+        return row
+
     def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
-        """The list of rows of `columns` numbers `key`, each within [low, high]; `of` says what they are."""
+        """Return the list of rows of `columns` numbers `key`, each within [low, high]; `of` names them."""
         rows = self._list(key, "must be a list of rows of numbers")
         for row in rows:
             if not isinstance(row, list) or len(row) != columns:
@@ -174,7 +152,7 @@ class Table:
         return tuple(tuple(self._number_of(number, key, low, high) for number in row) for row in rows)
 
     def _list(self, key: str, complaint: str) -> list[Any]:
-        """The list `key`, at least one value, at most `LONGEST_LIST`."""
+        """Return the list `key` of 1 to `LONGEST_LIST` values."""
         value = self.values.get(key)
         if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
             raise self.error("is missing" if value is None else complaint, key)
@@ -190,8 +168,37 @@ class Table:
         return float(value)
 
 
+def _joined(path: str, key: str) -> str:
+    return ".".join(filter(None, (path, key)))
+
+
+def _line_numbers(text: str) -> dict[str, int]:
+    """Find the line of each table and key, by path; tables of an array are numbered from 0."""
+    lines: dict[str, int] = {}
+    table, counts = "", Counter[str]()
+    for number, line in enumerate(text.split("\n"), start=1):
+        if header := _HEADER.match(line):
+            table = path = _path(header[2])
+            if header[1] == "[[":
+                lines.setdefault(path, number)
+                table = path = f"{path}.{counts[path]}"
+                counts[path.rpartition(".")[0]] += 1
+        elif key := _KEY.match(line):
+            path = _joined(table, _path(key[1]))
+        else:
+            continue
+        while path:  # [a.b] also makes the table a
+            lines.setdefault(path, number)
+            path = path.rpartition(".")[0]
+    return lines
+
+
+def _path(key: str) -> str:
+    return ".".join(part.strip(" \t\"'") for part in key.split("."))
+
+
 def is_file(path: Path) -> bool:
-    """Whether there is such a file. InputError where the system does not look: name too long, folder closed."""
+    """Whether there is such a file. InputError if the system cannot tell: name too long, no access to the folder."""
     try:
         return path.is_file()
     except OSError as error:
@@ -199,15 +206,15 @@ def is_file(path: Path) -> bool:
 
 
 def read_text(file: Path, most: int, encodings: tuple[str, ...] = ("utf-8",)) -> str:
-    """The text of `file`, of at most `most` bytes, in the first of `encodings` that fits. InputError."""
+    """Read the text of `file`, of at most `most` bytes, in the first of `encodings` that fits. InputError."""
     try:
         with file.open("rb") as stream:
             data = stream.read(most + 1)
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from error
     if len(data) > most:
-        raise InputError(f"{file}: is larger than {most / 1e6:g} MB; it is not read any further")
+        raise InputError(f"{file}: is larger than {most / 1e6:g} MB")
     for encoding in encodings:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding)
-    raise InputError(f"{file}: is no text in {encodings[0]}")
+    raise InputError(f"{file}: is not text in {encodings[0]}")

@@ -1,4 +1,4 @@
-"""A vehicle: what its TOML file says of its bus, its parameters, its battery and its model."""
+"""Read a vehicle file: bus, parameters, battery and model of one vehicle."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gz_onboard.events import MOST_EXTENDED, MOST_STANDARD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.battery_file import read_battery
 from gz_onboard.physics.derating import Derating, read_derating
-from gz_onboard.physics.effect import Effect
-from gz_onboard.physics.model import Model, read_model
+from gz_onboard.physics.effect import Effect, read_effects
+from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table, is_file
@@ -32,7 +32,7 @@ KEYS = (
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Everything that is known of one vehicle before it moves."""
+    """The contents of a vehicle file."""
 
     name: str
     file: Path
@@ -44,13 +44,13 @@ class Vehicle:
     range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
     range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
-    healthy: object = None  # what the discovery learned of it on healthy rides
-    vehicle_id: str = ""  # which it is of several with one file; then the end of its name
+    healthy: object = None  # file of what the discovery learned on healthy rides
+    vehicle_id: str = ""  # of one of several vehicles with this file; the end of its name
 
     __repr__ = brief
 
     def __str__(self) -> str:
-        """In a few lines: what somebody wants to see who has read it."""
+        """Summarise it in a few lines."""
         cells = (
             self.battery and f"{self.battery.cells_series} cells in series, {self.battery.cells_parallel} in parallel"
         )
@@ -66,12 +66,12 @@ class Vehicle:
 
     @property
     def key(self) -> str:
-        """What a saved state must agree with to be of use: the vehicle, its cells and its model list."""
+        """Name, cells and effects, in which a saved state must agree with the vehicle."""
         pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
         return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
 
     def identified(self, vehicle_id: str, where: str) -> Vehicle:
-        """The one that has this id, of several with this file. InputError, which begins with `where`, for no id."""
+        """Return the vehicle with this ID. InputError, which begins with `where`, for a bad ID or a second one."""
         if vehicle_id == self.vehicle_id:
             return self
         if self.vehicle_id:
@@ -83,19 +83,19 @@ class Vehicle:
         return replace(self, name=f"{self.name}-{vehicle_id}", vehicle_id=vehicle_id)
 
     def loaded(self, payload: float) -> Vehicle:
-        """The same with a rider and luggage of `payload` [kg]. InputError if that cannot be."""
+        """Return the vehicle with a rider and luggage of `payload` [kg]. InputError if out of range."""
         parameters = self.parameters.replaced(payload_mass=payload)
         return replace(self, parameters=parameters, model=Model(self.model.effects, parameters))
 
     @property
     def pack(self) -> Battery:
-        """The battery; InputError if the file has none."""
+        """The battery. InputError if the file has none."""
         if self.battery is None:
             raise self.error("has no [battery]: without one there is no range and nothing to simulate")
         return self.battery
 
     def publisher(self) -> Publisher:
-        """What sends the vehicle's range frames; InputError if their DBC file does not do."""
+        """Return the publisher of the vehicle's range frames. InputError if their DBC file is unsuitable."""
         identifier = self.range_identifier
         groups = self.mapping.j1939 and identifier is not None and identifier > MOST_STANDARD
         try:
@@ -104,7 +104,7 @@ class Vehicle:
             raise self.error(f"range_dbc: {error}") from error
 
     def changed(self, parameters: Parameters, effects: Iterable[Effect] | None = None) -> Vehicle:
-        """The same vehicle with other parameters, and other effects if they are given."""
+        """Return the vehicle with other parameters, and other effects if any are given."""
         effects = self.model.effects if effects is None else tuple(effects)
         return replace(
             self,
@@ -114,35 +114,27 @@ class Vehicle:
         )
 
     def error(self, message: str) -> InputError:
-        """The error to raise about this vehicle's file."""
+        """Return the error to raise about this vehicle's file."""
         return InputError(f"{self.file}: {message}")
 
 
 def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
-    """The vehicle file `name`: one of the package's own, or a path, which has a slash or ends in ``.toml``.
+    """Find the vehicle file `name`: a built-in vehicle, or a path, which has a slash or ends in ``.toml``.
 
-    beside: the folder from which a path is; the working directory if not given. InputError if there is none.
+    beside: the folder to which the path is relative; default: the working directory. InputError if there is none.
     """
-    own = sorted(file.stem for file in OWN.glob("*.toml"))
-    there_are = f"the package's own are {', '.join(own)}"
+    built_in = sorted(file.stem for file in OWN.glob("*.toml"))
     path = (beside or Path()) / name
     if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
         if is_file(path):
             return path
-        _check_no_folder(path)
-        raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
-    if name in own:
+    elif name in built_in:
         return OWN / f"{name}.toml"
-    meant = f" (did you mean './{name}'?)" if is_file(path) else nearest(name, own)
-    if not meant:
-        _check_no_folder(path)
-    raise InputError(f"{name}: no such vehicle file; {there_are}{meant}")
-
-
-def _check_no_folder(path: Path) -> None:
     if path.is_dir():
-        one = next((f"the vehicle file in it, such as {file}" for file in sorted(path.glob("*.toml"))), None)
-        raise InputError(f"{path}: is a folder; give {one or 'a vehicle file, which ends in .toml'}")
+        raise InputError(f"{path}: is a folder; give a vehicle file, which ends in .toml")
+    meant = f" (did you mean './{name}'?)" if is_file(path) else nearest(str(name), built_in)
+    shown_as = path if beside else name
+    raise InputError(f"{shown_as}: no such vehicle file; built-in vehicles are {', '.join(built_in)}{meant}")
 
 
 def read_vehicle(
@@ -152,10 +144,11 @@ def read_vehicle(
     users: Collection[int] | None = None,
     vehicle_id: str | None = None,
 ) -> Vehicle:
-    """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known.
+    """Read the vehicle `name` (a file or a built-in one). InputError.
 
-    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``, of which only those
-    run that nobody but `users` can change (see `read_model`). vehicle_id: which it is of several with this file.
+    payload: mass of rider and luggage [kg]; effects_folder: the user's effects, in addition to the file's own
+    ``effects_folder``, whose code runs only if nobody but `users` can change it (see `read_model`); vehicle_id: of one
+    of several vehicles with this file.
     """
     table = Table.read(find_vehicle(name))
     if "poll" in table.values:
@@ -163,7 +156,7 @@ def read_vehicle(
     table.only(KEYS.split())
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
-    effects = read_model(table, effects_folder, users)
+    effects = read_effects(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     model, derating = Model(effects, parameters), read_derating(table)
     spin = derating.top_spin
@@ -191,7 +184,7 @@ def read_vehicle(
 
 
 def _range_dbc(table: Table) -> Path:
-    """The DBC file of the range frames, found as those of the bus are."""
+    """Find the DBC file of the range frames."""
     name = table.check_path("range_dbc", table.text("range_dbc", RANGE_DBC))
     try:
         return find_dbc(name, table.file.parent)
@@ -200,7 +193,7 @@ def _range_dbc(table: Table) -> Path:
 
 
 def _range_identifier(table: Table) -> int | None:
-    """The identifier of the first range frame, if the file gives one."""
+    """Read the identifier of the first range frame, if the file gives one."""
     if "range_identifier" not in table.values:
         return None
     first = table.integer("range_identifier", 0, MOST_EXTENDED - MESSAGES * GROUP_STEP)
@@ -213,7 +206,7 @@ def _range_identifier(table: Table) -> int | None:
 
 
 def _name(table: Table) -> str:
-    """The vehicle's name, which becomes part of the names of files: no path, nothing that a shell would take apart."""
+    """Read the name, which becomes part of file names: no path, nothing that a shell would split."""
     name = table.text("name")
     if not re.fullmatch(NAME, name):
         raise table.error(f"must be {NAME_TEXT}, is {shown(name)}", "name")
@@ -221,7 +214,7 @@ def _name(table: Table) -> str:
 
 
 def _healthy(table: Table) -> Path | None:
-    """The file of what the discovery learned on healthy rides, beside the vehicle file."""
+    """Find the discovery's file of healthy rides, relative to the vehicle file."""
     table.only(["file", "rides"])
     if "file" not in table.values:
         return None

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -29,13 +30,14 @@ from hypothesis import strategies as st
 
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.library_bus import LibraryBus
 from gz_onboard.bus.recorder import Limits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary
 from gz_onboard.daemon.loop import Daemon, fair_share
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, TRANSMITTED, WINDOW, Frame, Reason, State
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.logs import read_frames, read_samples
 from tests.support import S, Scooter, check_frames, reference, ridden
@@ -238,7 +240,7 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
     saved = state_of(file)
     with Scene(bus, state_file=file) as scene:
         scene.ride(2.0)  # it waits for an odometer that does not come
-        assert "going on from the state saved" in caplog.text
+        assert "continuing from the state saved" in caplog.text
         after = scene.daemon.pipeline.estimator.filter
     assert after is not None
     assert after.soc == pytest.approx(before.soc, abs=1e-3)
@@ -288,8 +290,7 @@ def is_fresh(daemon: Daemon) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
-    [(foreign, "is of 'another scooter', this is 'reference-scooter'"), (other_version, "is of version 99")],
+    ("spoil", "said"), [(foreign, "['another scooter', '10s4p'] saved"), (other_version, "is of version 99")]
 )
 def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
@@ -310,6 +311,10 @@ def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     assert aside.read_bytes() == text
 
 
+def impossible_covariance(snapshot: Snapshot) -> None:
+    snapshot["covariance"] = [1e-4, 1.0, 1e-4]
+
+
 def odd_weakest(snapshot: Snapshot) -> None:
     snapshot["learned"]["weakest"] = {"of": "much"}
 
@@ -326,74 +331,45 @@ def with_a_large_bias(snapshot: Snapshot) -> None:
     snapshot["gyro_bias"] = [9.0, 0.0]
 
 
-def riding_of(estimator: Estimator) -> Snapshot:
-    """What is known of the riding, but for how long the vehicle has stood."""
-    return estimator.forecaster.snapshot() | {"still": 0.0}
+def with_more(snapshot: Snapshot) -> None:
+    snapshot["riding"]["another"] = 1.0
+
+
+def not_a_number(snapshot: Snapshot) -> None:
+    snapshot["v1"] = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said", "part"),
+    ("spoil", "said"),
     [
-        (implausible, "is damaged: its charge holds implausible numbers: not used", "charge"),
-        (without_numbers, "is damaged: its charge ", "charge"),
-        (incomplete, "is damaged: its riding lacks riding", "riding"),
-        (without_states, "is damaged: its riding ", "riding"),
-        (odd_capacity, "is damaged: its capacity or resistance holds implausible numbers", "capacity"),
-        (odd_weakest, "is damaged: its weakest holds implausible numbers", "weakest"),
-        (without_learned, "is damaged: its capacity or resistance is not as it was saved", "learned"),
-        (with_a_large_bias, "is damaged: its gyro bias holds implausible numbers", "gyro bias"),
+        (implausible, "state.soc is 5.0, not from 0 to 1"),
+        (without_numbers, "state.covariance.0 is 'a'"),
+        (impossible_covariance, "state.covariance is impossible"),
+        (incomplete, "state has "),
+        (without_states, "state.riding.states is None"),
+        (odd_capacity, "implausible capacity"),
+        (odd_weakest, "state.learned.weakest has ['of'], not of, known, kept"),
+        (without_learned, "state.learned has [1, 2], not capacity, resistance, weakest"),
+        (with_a_large_bias, "state.gyro_bias.0 is 9.0"),
+        (with_more, "state.riding has "),
+        (not_a_number, "state.v1 is nan"),
     ],
 )
-def test_what_is_sound_of_a_damaged_state_is_gone_on_from(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    learned: Snapshot,
-    spoil: Callable[[Snapshot], None],
-    said: str,
-    part: str,
+def test_a_damaged_state_is_refused_whole_and_the_one_before_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
 ):
     file = tmp_path / "scooter.json"
     snapshot = copy.deepcopy(learned)
-    snapshot["learned"]["capacity"]["inverse"] = 1.02
     spoil(snapshot)
-    state.write(file, state.encode(snapshot, time.time()))
+    sealed = json.dumps({"saved_at": time.time(), "uptime": None, "estimator": snapshot}).encode()[1:]
+    state.write(file, b'{"crc32": "%08x", %s\n' % (zlib.crc32(sealed), sealed))
     daemon = Daemon(reference(), [], None, file)
-    assert daemon.restore() is not None
+    assert daemon.restore() is None
     assert said in caplog.text
-    assert f"{file.stem}.refused-1.json without its damaged parts, which begin anew: {part}\n" in caplog.text
-    ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
-    as_new = {
-        "charge": ours.soc.saved is None,
-        "riding": riding_of(ours) == riding_of(new),
-        "gyro bias": ours.road.bias_x == 0,
-        "capacity": ours.soc.ageing.snapshot()["capacity"] == new.soc.ageing.snapshot()["capacity"],
-    }
-    lost = {"learned": {"capacity"}, "weakest": set()}.get(part, {part})
-    assert {name for name, fresh in as_new.items() if fresh} == lost
-    again = Daemon(reference(), [], None, file)  # it was saved so, whole
-    caplog.clear()
-    assert again.restore() is not None
-    assert "damaged" not in caplog.text
-
-
-def test_without_its_charge_the_capacity_has_no_covariance_with_it(tmp_path: Path, learned: Snapshot):
-    file = tmp_path / "scooter.json"
-    capacity = learned["learned"]["capacity"]
-    spoilt = {
-        **learned,
-        "soc": 5.0,
-        "learned": {"capacity": {**capacity, "with_soc": 0.5 * capacity["variance"] ** 0.5}},
-    }
-    state.write(file, state.encode(spoilt, time.time()))
-    found = Daemon(reference(), [], None, file).restore()
-    assert found is not None
-    assert found["learned"]["capacity"] == {**capacity, "with_soc": 0.0}
-
-
-def test_a_whole_state_is_gone_on_from_before_the_parts_of_a_later_one(tmp_path: Path, learned: Snapshot):
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
-    state.write(file, state.encode({**learned, "soc": 5.0}, time.time()))
+    assert "no saved state can be used: starting fresh" in caplog.text
+    assert is_fresh(daemon)
+    file.with_name("scooter.json.refused").replace(file)
+    state.copies(file)[1].write_bytes(state.encode({**learned, "soc": 0.41}, time.time()))
     found = Daemon(reference(), [], None, file).restore()
     assert found is not None
     assert found["soc"] == 0.41
@@ -423,8 +399,8 @@ def test_where_the_latest_state_is_damaged_the_one_before_is_used(
     file = tmp_path / "scooter.json"
     state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
     state.write(file, state.encode({**learned, "soc": 0.42}, time.time()))
-    unfinished, latest, _ = state.copies(file)
-    unfinished.write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
+    latest, _ = state.copies(file)
+    file.with_suffix(".new").write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
     data = bytearray(latest.read_bytes())
     data[150] ^= 4
     latest.write_bytes(data)
@@ -432,26 +408,23 @@ def test_where_the_latest_state_is_damaged_the_one_before_is_used(
     found = daemon.restore()
     assert found is not None
     assert found["soc"] == 0.41
-    assert caplog.text.count("not used, kept as") == 2
-    assert "going on from the state saved" in caplog.text
+    assert caplog.text.count("not used, kept as") == 1
+    assert "continuing from the state saved" in caplog.text
     assert [path.suffixes[-2:] for path in sorted(tmp_path.iterdir())] == [
+        [".json", ".refused"],
+        [".new"],
         [".previous", ".json"],
-        [".refused-1", ".json"],
-        [".refused-2", ".json"],
     ]
 
 
-def test_a_cut_between_two_names_loses_nothing(tmp_path: Path, learned: Snapshot):
-    """The new state is whole, and not yet in the place of the old one."""
+def test_a_power_cut_between_two_renames_leaves_the_state_before(tmp_path: Path, learned: Snapshot):
     file = tmp_path / "scooter.json"
     state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
-    state.write(tmp_path / "other.json", state.encode({**learned, "soc": 0.42}, time.time()))
-    unfinished, _, before = state.copies(file)
-    (tmp_path / "other.json").replace(unfinished)
-    file.replace(before)
+    latest, before = state.copies(file)
+    latest.replace(before)
     found = Daemon(reference(), [], None, file).restore()
     assert found is not None
-    assert found["soc"] == 0.42
+    assert found["soc"] == 0.41
 
 
 def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -476,13 +449,13 @@ def test_a_state_that_cannot_be_saved_is_told_and_counts_at_the_end(
     monkeypatch.setattr(channel, "send", sent.append)
     daemon = Daemon(reference(), [channel], None, tmp_path / "folder" / "scooter.json")
     assert daemon._keeper is not None
-    keeper, folder, frames = daemon._keeper, tmp_path / "folder", Scooter().steady(1.0)
+    keeper, folder, frames = daemon._keeper, tmp_path / "folder", Scooter().steady(2.0)
 
     def told(second: int) -> float:
         later = [(frame[0] + second * S, *frame[1:]) for frame in frames]
         daemon.step(later, later[-1][0])
         assert keeper._thread.wait(20)
-        daemon.step([], later[-1][0] + TICK_NS)
+        daemon.step([], later[-1][0] + S)
         return check_frames(sent)["RANGE_Status"][-1]["RANGE_SaveFailed"]
 
     folder.write_text("in the way")
@@ -517,15 +490,15 @@ def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest
     monkeypatch.setattr(channel, "drain", drain_and_set)
     with can.Bus(interface="virtual", channel=bus) as other:  # time begins with the first frame
         other.send(can.Message(arbitration_id=0x413, data=bytes(2), is_extended_id=False))
-    for _ in range(12):
+    for _ in range(20):
         time.sleep(0.1)
-        daemon.round()
+        daemon.tick()
         last = daemon.pipeline.last
         ticks += [(last.time, time.monotonic())] if last else []
     channel.close()
-    steps = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ticks[1:])]
     assert ahead
-    assert all(0 <= told == pytest.approx(passed, abs=0.21) for told, passed in steps), steps
+    assert all(0 <= b[0] - a[0] <= WINDOW + 1e-6 for a, b in pairwise(ticks)), ticks
+    assert ticks[-1][0] - ticks[0][0] == pytest.approx(ticks[-1][1] - ticks[0][1], abs=WINDOW + 0.21)
 
 
 def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.MonkeyPatch):
@@ -534,8 +507,8 @@ def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.Monke
     daemon = Daemon(reference(), [left, right], recorder=None, state_file=None)
     taken: list[Frame] = []
     monkeypatch.setattr(daemon, "step", lambda frames, now_ns: taken.extend(frames))
-    monkeypatch.setattr(left, "up", True)
-    monkeypatch.setattr(right, "up", True)
+    left.open()
+    right.open()
     came = [(time.time_ns() - (60 - i) * 1_000_000, 0x123, b"", i % 2) for i in range(60)]
 
     def parts(channel: CanChannel, of: list[Frame], count: int):
@@ -549,14 +522,14 @@ def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.Monke
     monkeypatch.setattr(left, "drain", parts(left, came[0::2], 4))
     monkeypatch.setattr(right, "drain", parts(right, came[1::2], 100))
     for _ in range(10):
-        daemon.round()
+        daemon.tick()
     assert taken == came
     silent = [(time.time_ns() - 10_000_000, 0x123, b"", 1)]
     monkeypatch.setattr(left, "drain", parts(left, [(time.time_ns() - S, 0x123, b"", 0)] * 100, 1))  # a second behind
     monkeypatch.setattr(right, "drain", parts(right, silent[:], 1))
     for _ in range(5):
         time.sleep(0.1)
-        daemon.round()
+        daemon.tick()
     assert silent[0] in taken
 
 
@@ -611,7 +584,8 @@ def test_a_bus_that_never_runs_dry_does_not_silence_it(bus: str, monkeypatch: py
     with Scene(bus) as scene:
         message = can.Message(arbitration_id=0x413, data=bytes(2), is_extended_id=False)
         (channel,) = scene.daemon.channels
-        monkeypatch.setattr(channel._bus, "recv", lambda timeout: message)
+        assert isinstance(channel._bus, LibraryBus)
+        monkeypatch.setattr(channel._bus._bus, "recv", lambda timeout: message)
         begin = len(scene.heard)
         time.sleep(3.0)
         heard = scene.heard[begin:]
@@ -678,11 +652,9 @@ def test_fair_shares(kinds: list[int], most: int):
     assert kept == sorted(kept)
     assert set(kept) <= set(frames)
     came, stayed = Counter(kinds), Counter(channel * 5 + identifier for _, identifier, _, channel in kept)
-    assert len(kept) <= max(most, len(came))
-    assert len(kept) >= min(len(frames), most) - len(came)
-    least = min((n for kind, n in stayed.items() if n < came[kind]), default=len(frames))
     assert set(stayed) == set(came)
-    assert all(n >= min(came[kind], least) for kind, n in stayed.items())  # who has more had more
+    assert len(kept) <= max(most, len(came))
+    assert len(frames) > most or kept == frames
     for kind, n in stayed.items():  # the latest of each
         assert [f for f in kept if f[3] * 5 + f[1] == kind] == [f for f in frames if f[3] * 5 + f[1] == kind][-n:]
 
@@ -765,10 +737,7 @@ from gz_onboard.daemon import command
 with ExitStack() as locks:
     command._lock(locks, sys.argv[1], [sys.argv[2]], Path(sys.argv[3]))
     print("held", flush=True)
-    time.sleep(float(sys.argv[4]))
-    if len(sys.argv) > 5:
-        import os, signal
-        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(60)
 """
 
 
@@ -788,12 +757,9 @@ def take(interface: str, name: str, folder: Path) -> None:
         _lock(locks, interface, [name], folder)
 
 
-def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr("gz_onboard.daemon.command.LOCK_S", 0.3)
+def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(tmp_path: Path):
     name = f"can{os.getpid()}"  # the names are those of the whole machine
-    with holder("socketcan", name, tmp_path / "a", 60):
+    with holder("socketcan", name, tmp_path / "a"):
         with pytest.raises(InputError, match=f"--channel {name}: another gz-onboard run has it"):
             take("socketcan", name, tmp_path / "b")
         with pytest.raises(InputError, match=r"--state-dir .*another gz-onboard run uses it"):
@@ -803,16 +769,8 @@ def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(
     take("socketcan", name, tmp_path / "a")
 
 
-@pytest.mark.parametrize("crash", [(), ("crash",)])
-def test_one_that_is_ending_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crash: tuple[str, ...]):
-    monkeypatch.setattr("gz_onboard.daemon.command.LOCK_S", 60.0)
-    name = f"can{os.getpid()}"
-    with holder("socketcan", name, tmp_path, 1.0, *crash):
-        take("socketcan", name, tmp_path)
-
-
 def test_the_command_says_so_and_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with holder("udp_multicast", "239.0.0.77", tmp_path, 60):
+    with holder("udp_multicast", "239.0.0.77", tmp_path):
         arguments = ["run", "--interface", "virtual", "--channel", "x", "--state-dir", str(tmp_path)]
         assert main(arguments) == 2
     assert "another gz-onboard run uses it" in capsys.readouterr().err
@@ -867,7 +825,7 @@ def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
         daemon.step(frames[half + 1 :], frames[-1][0])  # so soon after the first it is not saved
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr(daemon, "round", broken)
+    monkeypatch.setattr(daemon, "tick", broken)
     with pytest.raises(RuntimeError, match="unforeseen"):
         daemon.run()
     (path,) = recorder.paths

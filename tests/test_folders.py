@@ -53,7 +53,7 @@ MORE = [
     (["vehicle", "check", FULL, RIDE], "FULL: is a folder; the vehicle comes first, by name or file, then its logs"),
     (["vehicle", "check", FULL, "v.toml"], "FULL: is a folder; the vehicle comes first, by name or file, then its"),
     (["vehicle", "check", "a.blf.gz", "v.toml"], "a.blf.gz: is a log; the vehicle comes first"),
-    (["vehicle", "check", "vehicles", RIDE], "is a folder; give the vehicle file in it, such as vehicles/v.toml"),
+    (["vehicle", "check", "vehicles", RIDE], "is a folder; give a vehicle file, which ends in .toml"),
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
     (["plot", FULL, "one.png"], "one.png: of a folder, each picture has the name of its log; leave it out"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),
@@ -93,27 +93,6 @@ def test_a_folder_without_logs(arguments: list[str], capsys: pytest.CaptureFixtu
 def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("folders")
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["run", FULL], "run takes files and folders behind its options only: --vehicle NAME|TOML, "),
-        (["run", "a.blf.gz"], "; a recorded ride is for estimate, or for replay onto a bus"),
-        (["learned", FULL], "learned takes files and folders behind its options only: --vehicle NAME|TOML, --json"),
-        (["learned", "scooter.json"], "--state FILE\n"),
-        (["foxglove", FULL], "--vehicle NAME|TOML, --write-layout FILE; a recorded ride is for estimate, or for"),
-    ],
-)
-def test_a_command_without_files_says_where_they_go(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(arguments)
-    told = capsys.readouterr().err
-    assert said in told
-    assert "before the options" not in told
 
 
 def test_the_page_of_the_commands_has_them() -> None:

@@ -18,6 +18,7 @@ from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.events import Group
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
@@ -26,9 +27,7 @@ from tests.events import EventEstimator
 
 VEHICLE = read_vehicle("reference", 75.0)
 PLAIN = VEHICLE.pack
-COLD = replace(
-    PLAIN, rest_shift_temperature=(-10.0, 10.0, 25.0), rest_shift_value=(-0.03, -0.01, 0.0), rest_shift_sd=0.004
-)
+COLD = replace(PLAIN, rest_shift_curve=PiecewiseLinear((-10.0, 10.0, 25.0), (-0.03, -0.01, 0.0)), rest_shift_sd=0.004)
 TABLE = """
 [battery.rest_shift]
 temperature = [-10.0, 10.0, 25.0]
@@ -57,11 +56,7 @@ def read(folder: Path, table: str) -> Battery:
 
 def test_the_table_is_read(tmp_path):
     battery = read(tmp_path, TABLE)
-    assert (battery.rest_shift_temperature, battery.rest_shift_value, battery.rest_shift_sd) == (
-        COLD.rest_shift_temperature,
-        COLD.rest_shift_value,
-        COLD.rest_shift_sd,
-    )
+    assert (battery.rest_shift_curve, battery.rest_shift_sd) == (COLD.rest_shift_curve, COLD.rest_shift_sd)
     assert battery.rest_shift(0.0) == pytest.approx(-0.02)
     assert (battery.rest_shift(-40.0), battery.rest_shift(60.0)) == (-0.03, 0.0)
 
@@ -71,7 +66,7 @@ def test_the_table_is_read(tmp_path):
     [
         ('"V"', '"mV"', ["battery.rest_shift", "mV", "V"]),
         ("-0.010, 0.0", "-0.010", ["battery.rest_shift", "3 numbers", "one for each temperature"]),
-        ("-0.030", "-30.0", ["battery.rest_shift", "within -0.2 to 0.2 V"]),
+        ("-0.030", "-30.0", ["battery.rest_shift", "outside -0.2 to 0.2"]),
         ("-10.0, 10.0", "10.0, -10.0", ["battery.rest_shift", "must increase"]),
         ("sd = 0.004", "sd = 4.0", ["battery.rest_shift", "sd", "0.2"]),
         ("unit", "units", ["battery.rest_shift", "did you mean 'unit'"]),
@@ -95,7 +90,7 @@ def test_without_the_table_the_same_bits(soc, temperature, power):
     assert PLAIN.ocv(soc, temperature) == PLAIN.ocv(soc)
     volts = PLAIN.ocv(soc)[0]
     assert PLAIN.soc_at(volts, temperature) == PLAIN.soc_at(volts)
-    flat = replace(COLD, rest_shift_value=(0.0, 0.0, 0.0))
+    flat = replace(COLD, rest_shift_curve=PiecewiseLinear((-10.0, 25.0), (0.0, 0.0)))
     assert flat.settled_current(power, soc, temperature) == PLAIN.settled_current(power, soc, temperature)
 
 
@@ -173,9 +168,9 @@ def test_what_the_circuit_errs_by_is_read_over_temperature(tmp_path):
     battery = read(tmp_path, ERRORS)
     assert battery.voltage_error(-20.0, 0.01) == pytest.approx(0.020)
     assert battery.voltage_error(7.5, 0.01) == pytest.approx(0.013)
-    without = replace(PLAIN, voltage_error_temperature=(), voltage_error_value=())
+    without = replace(PLAIN, voltage_error_curve=None)
     assert without.voltage_error(7.5, 0.01) == 0.01
-    with pytest.raises(InputError, match=r"voltage_error.* 2 numbers within 0 to 0\.2 V"):
+    with pytest.raises(InputError, match=r"voltage_error.*outside 0 to 0\.2"):
         read(tmp_path, ERRORS.replace("0.020", "-0.020"))
 
 
@@ -197,7 +192,7 @@ def test_for_how_long_it_errs_the_same_way_is_read_over_temperature(tmp_path):
     cold, warm = (over.slow(0.6, t, 0.2**2).time for t in (-10.0, 25.0))  # before anything is known of the charge
     assert cold == pytest.approx(1000.0, rel=0.01)
     assert 160.0 < warm < 0.2 * cold
-    with pytest.raises(InputError, match=r"voltage_error_time.* 2 numbers within 10 to 36000 s"):
+    with pytest.raises(InputError, match=r"voltage_error_time.*outside 10 to 36000"):
         read(tmp_path, TIMES.replace("160.0", "1.0"))
     with pytest.raises(InputError, match=r"voltage_error_time.*min"):
         read(tmp_path, TIMES.replace('"s"', '"min"'))

@@ -87,7 +87,7 @@ def test_a_machine_without_the_directory_of_clocks_has_none(tmp_path: Path):
 
 def sealed(text: bytes) -> bytes:
     """As `state` writes it, whatever it is."""
-    return b'{"format": 2, "crc32": "%08x", %s\n' % (zlib.crc32(text), text)
+    return b'{"crc32": "%08x", %s\n' % (zlib.crc32(text), text)
 
 
 @pytest.mark.parametrize(
@@ -99,8 +99,7 @@ def sealed(text: bytes) -> bytes:
         b"null",
         b"\x00" * 4096,  # what a power cut leaves of a file that was not synced
         b"\xff\xfe{",
-        b'{"saved_at": 1.7e9, "estimator": {}}',  # without a checksum, as before format 2
-        sealed(b'"estimator": {}}').replace(b'"format": 2', b'"format": 3'),
+        b'{"saved_at": 1.7e9, "estimator": {}}',  # without a checksum
         sealed(b'"saved_at": 1.7e9}'),
         sealed(b'"estimator": {}}'),
         sealed(b'"saved_at": 1.7e9, "estimator": {"name": "\xfc"}}'),
@@ -114,7 +113,7 @@ def sealed(text: bytes) -> bytes:
 def test_damaged(tmp_path: Path, text: bytes):
     file = tmp_path / "scooter.json"
     file.write_bytes(text)
-    with pytest.raises(ValueError, match=r"is empty|is not a saved state|is damaged|is of format 3"):
+    with pytest.raises(ValueError, match=r"is empty|is not a saved state|is damaged"):
         state.load(file, NOW)
 
 
@@ -136,21 +135,10 @@ def test_the_one_before_is_kept(tmp_path: Path):
     file = tmp_path / "scooter.json"
     for n in range(3):
         state.write(file, state.encode({"n": n}, NOW))
-    _, latest, before = state.copies(file)
+    latest, before = state.copies(file)
     assert state.load(latest, NOW) == ({"n": 2}, 0.0)
     assert state.load(before, NOW) == ({"n": 1}, 0.0)
     assert sorted(tmp_path.iterdir()) == sorted([latest, before])
-
-
-def test_of_those_set_aside_the_latest_are_kept(tmp_path: Path):
-    file = tmp_path / "scooter.json"
-    for n in range(5):
-        file.write_text(f"{n}")
-        aside = state.set_aside(file, file)
-        assert aside is not None
-        assert aside.read_text() == f"{n}"
-    assert sorted(path.read_text() for path in tmp_path.iterdir()) == ["2", "3", "4"]
-    assert state.set_aside(file, file) is None  # there is none
 
 
 def test_a_pipe_in_its_place_is_refused(tmp_path: Path):
@@ -206,7 +194,7 @@ def test_killed_at_any_time_it_leaves_a_whole_one(tmp_path: Path):
                 time.sleep(0.01)
             time.sleep(0.02 + 0.007 * attempt)
             os.kill(process.pid, signal.SIGKILL)
-        found = [state.load(copy, NOW) for copy in state.copies(file)[1:] if copy.exists()]
+        found = [state.load(copy, NOW) for copy in state.copies(file) if copy.exists()]
         assert found[0] is not None
         snapshot = found[0][0]
         assert snapshot["row"] == [snapshot["n"]] * 2000
@@ -223,14 +211,13 @@ def test_a_state_by_a_link_is_that_of_its_target(tmp_path: Path):
     state.write(link, state.encode({"n": 2}, NOW))
     assert link.is_symlink()
     assert state.copies(link) == state.copies(target)
-    assert [state.load(copy, NOW) for copy in state.copies(target)[1:]] == [({"n": 2}, 0.0), ({"n": 1}, 0.0)]
-    assert state.set_aside(link, state.copies(link)[1]) == target.with_suffix(".refused-1.json")
+    assert [state.load(copy, NOW) for copy in state.copies(target)] == [({"n": 2}, 0.0), ({"n": 1}, 0.0)]
     assert [file.name for file in link.parent.iterdir()] == ["mine.json"]
 
 
 def test_a_name_that_cannot_be_looked_up_is_no_link(tmp_path: Path):
     file = tmp_path / f"{'x' * 300}.json"
-    assert state.copies(file)[1] == file
+    assert state.copies(file)[0] == file
     with pytest.raises(ValueError, match="cannot be read"):
         state.load(file, NOW)
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import BASE_EFFECTS
+from gz_onboard.physics.effect import BASE_EFFECTS, QUANTITIES
 
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
@@ -48,8 +47,8 @@ FORBIDDEN = {
 
 OFFLINE = ("recording", "offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
-# Imported only when asked for, or for types: the reference filter behind --filter filterpy, arrays.
-ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
+# Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
+ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py", "bridges/broker.py"}
 
 # The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
 # that stand before it.
@@ -148,6 +147,16 @@ def test_the_daemon_loads_nothing_heavy(name):
     assert not HEAVY & loaded
 
 
+def test_the_daemon_starts_light():
+    """Without numpy, and on SocketCAN without python-can, which costs 9 MB."""
+    code = (
+        "import sys; from gz_onboard.daemon import command; from gz_onboard.vehicle import read_vehicle;"
+        "from gz_onboard.pipeline import Pipeline; Pipeline(read_vehicle('reference')); print(*sys.modules)"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"numpy", "scipy", "can", "asyncio", "ssl"} & set(loaded)
+
+
 def test_the_api_is_loaded_only_when_asked_for():
     code = (
         "import sys, gz_onboard.daemon.command as command, gz_onboard as gz; own = 'gz_onboard.api';"
@@ -199,7 +208,7 @@ def test_imports_of_the_discovery_go_down_its_stages():
 def test_effects_are_known_by_what_they_declare():
     """No name of an effect outside its file, but for the list of those that a vehicle file gets that lists none."""
     effects = {path.stem for path in (PACKAGE / "physics/effects").glob("*.py")} - set(QUANTITIES)
-    listed = {PACKAGE / "physics/model.py": set(BASE_EFFECTS)}
+    listed = {PACKAGE / "physics/effect.py": set(BASE_EFFECTS)}
     for module in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "physics/effects").glob("*.py")):
         nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
         named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects

@@ -97,7 +97,7 @@ def _going_on(
     with held(file):
         at = state_at(file, source, span_of(source, vehicle))
         ridden = ride_through(open_estimate(source, vehicle), replace(how, state=at), log, progress)
-        if ridden.went_on and (text := text_of(ridden.pipeline, ridden.went_on)):
+        if ridden.went_on and (text := text_of(ridden.pipeline)):
             with writing(file):
                 saved_state.write(file, text)
     return ridden
@@ -113,7 +113,7 @@ def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
 @checked
 def read_estimates(log: PathLike) -> LoggedEstimates:
     """The estimates that the daemon or ``gz-onboard estimate`` wrote into an MCAP log. InputError if it has none."""
-    source = export_tables.Source(Path(log))
+    source = export_tables.ExportSource(Path(log))
     rows = export_tables.estimate_rows(source)
     columns = export_tables.topic_columns(source.log, ESTIMATE_TOPIC)
     return LoggedEstimates(columns, [time_ns for time_ns, _ in rows], [values for _, values in rows])

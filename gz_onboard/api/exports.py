@@ -122,11 +122,11 @@ def read_signals(
 
 def _source(
     log: PathLike, start: float, end: float | None, columns: Sequence[str] | None = None
-) -> export_tables.Source:
+) -> export_tables.ExportSource:
     within("start", start, {"start": (0.0, LONGEST_LOG, "s")})
     if end is not None and not end > start:
         raise InputError(f"end {end:g} s: must be after start {start:g} s")
-    return export_tables.Source(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
+    return export_tables.ExportSource(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
 
 
 def _times(times: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.datetime64]]:

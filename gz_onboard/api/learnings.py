@@ -54,8 +54,6 @@ def read_learned(file: PathLike | None = None, vehicle: VehicleLike = "reference
     another vehicle's or damaged.
     """
     known = vehicle_of(vehicle)
-    path = state_file(command.USUAL_FOLDER, known.name) if file is None else Path(file)
-    snapshot, age = command.load(path, known)
-    with command.sound(path):
-        battery, riders = command.read_learned(known, snapshot), command.read_riders(known, snapshot)
-    return LearnedState(known.name, age, battery, riders)
+    path = state_file(command.STATE_FOLDER, known.name) if file is None else Path(file)
+    estimator, age = command.read_state(path, known)
+    return LearnedState(known.name, age, command.battery_learned(estimator), command.riders_learned(estimator))

@@ -1,1 +1,1 @@
-"""What the range frames say, to who is not on the bus: an MQTT broker, Foxglove."""
+"""Bridges from the range frames to an MQTT broker and to Foxglove."""

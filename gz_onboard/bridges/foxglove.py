@@ -1,106 +1,88 @@
-"""``gz-onboard foxglove``: range frames and positions, live in Foxglove, on topics and by schemas of the log."""
+"""``gz-onboard foxglove``: range frames and positions, live in Foxglove, with the topics and schemas of the log."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gz_onboard import notify
 from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.constants import WH
-from gz_onboard.dashboard.command import add_source, channel_of, range_view
+from gz_onboard.dashboard.command import add_source, channel_of, view_of
 from gz_onboard.dashboard.picture import Picture
-from gz_onboard.dashboard.pictures import pictures
+from gz_onboard.dashboard.pictures import pictures, until_signalled
 from gz_onboard.dashboard.server import host_and_port
-from gz_onboard.dashboard.stopping import until_signalled
 from gz_onboard.errors import OK, InputError, require, writing
 from gz_onboard.events import Frame, RouteState
 from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
-from gz_onboard.options import add_shared
-from gz_onboard.vehicle import Vehicle, read_vehicle
-
-if TYPE_CHECKING:
-    import foxglove
+from gz_onboard.vehicle import read_vehicle
 
 LISTEN = "127.0.0.1:8765"
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
-UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
+UNKNOWN = "UNKNOWN"  # state or activity that no range frame says
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard foxglove``."""
     add_source(parser)
-    vehicle = "the vehicle, as for run: its range frames, and where it is, if its file maps latitude and longitude"
-    add_shared(parser, "--vehicle", default=None, help=vehicle)
-    listen = "where Foxglove finds it (default: %(default)s; port 0: any free one)"
+    listen = "address for Foxglove to connect to (default: %(default)s; port 0: any free one)"
     parser.add_argument("--listen", metavar="ADDRESS:PORT", default=LISTEN, help=listen)
-    layout = "write the layout that fits logs and live topics, for Foxglove to import, and end"
+    layout = "write a layout for logs and live topics, for Foxglove to import, and end"
     parser.add_argument("--write-layout", type=Path, metavar="FILE", help=layout)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard foxglove``: 0 when it is ended; InputError for what cannot be used."""
+    """``gz-onboard foxglove``: 0 when it is ended. InputError for bad options."""
     if arguments.write_layout:
         with writing(arguments.write_layout):
             arguments.write_layout.write_bytes(LAYOUT.read_bytes())
         return OK
     require("foxglove")
-    host, port = host_and_port(arguments.listen)
-    end = time.monotonic() + (arguments.duration or math.inf)
-    view = range_view(arguments)
-    positions = _positions(read_vehicle(arguments.vehicle)) if arguments.vehicle else None
-    others = positions.identifiers if positions else ()
-    with channel_of(arguments, view, others) as channel, until_signalled() as stopped:
-        import foxglove
+    import foxglove
 
-        context = foxglove.Context()
-        estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
-        places = _Places(positions, context) if positions else None
+    host, port = host_and_port(arguments.listen)
+    view = view_of(arguments)
+    context = foxglove.Context()
+    estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
+    positions = _positions(arguments.vehicle) if arguments.vehicle else None
+    places = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context) if positions else None
+
+    def show_positions(frames: Sequence[Frame]) -> None:
+        if positions and places:
+            for row in positions.take(frames):
+                places.log(_json(row), log_time=time.time_ns())
+
+    others = positions.identifiers if positions else ()
+    with channel_of(arguments, view, others) as channel, until_signalled(arguments.duration) as stopped:
         try:
             server = foxglove.start_server(
                 name=f"gz-onboard {channel.name}", host=host, port=port, capabilities=[], context=context
             )
-        except RuntimeError as error:  # an address that cannot be had
+        except RuntimeError as error:  # the address cannot be used
             raise InputError(f"--listen {arguments.listen}: {error}") from error
         try:
             address = f"[{host}]" if ":" in host else host
             _say(f"ws://{address}:{server.port} shows {channel.name} ({channel.interface})")
-            heard = places.show if places else lambda _: None
-            for new in pictures(view, channel, lambda: stopped() or time.monotonic() >= end, heard):
-                estimates.log(encoded(new), log_time=time.time_ns())
+            for new in pictures(view, channel, stopped, show_positions):
+                estimates.log(_json(row_of(new)), log_time=time.time_ns())
         finally:
             notify.stopping()
             server.stop()
     return OK
 
 
-def _positions(vehicle: Vehicle) -> LivePositions | None:
-    """Those of the vehicle, if its file maps any."""
-    if lacking := LivePositions.lacking(vehicle):
-        _say(f"{vehicle.file}: [roles] has no {' and no '.join(lacking)}: no position is shown")
+def _positions(name: str) -> LivePositions | None:
+    """The positions of the vehicle `name`, if its file maps them."""
+    vehicle = read_vehicle(name)
+    if missing := LivePositions.lacking(vehicle):
+        _say(f"{vehicle.file}: [roles] has no {' and no '.join(missing)}: no position is shown")
         return None
     return LivePositions(vehicle)
-
-
-class _Places:
-    """Shows positions as they come."""
-
-    def __init__(self, positions: LivePositions, context: foxglove.Context) -> None:
-        import foxglove
-
-        self._positions = positions
-        self._channel = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context)
-
-    def show(self, frames: Sequence[Frame]) -> None:
-        for row in self._positions.take(frames):
-            self._channel.log(_message(row), log_time=time.time_ns())
 
 
 def _say(text: str) -> None:
@@ -109,17 +91,12 @@ def _say(text: str) -> None:
     notify.ready(text)
 
 
-def encoded(picture: Picture) -> bytes:
-    """As a message of `ESTIMATE_TOPIC`."""
-    return _message(row_of(picture))
-
-
-def _message(row: Mapping[str, object]) -> bytes:
+def _json(row: Mapping[str, object]) -> bytes:
     return json.dumps(row, separators=(",", ":"), allow_nan=False).encode()
 
 
 def row_of(picture: Picture) -> dict[str, object]:
-    """A picture as an estimate stands in logs: SI units, None for what is stale or what no range frame says."""
+    """Convert a picture to an estimate as in logs: SI units, None for numbers that are stale or in no range frame."""
     charge, route, battery = picture.charge, picture.route, picture.battery
     numbers = {
         "soc": (battery.soc_percent, 0.01),

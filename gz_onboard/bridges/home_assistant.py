@@ -1,7 +1,7 @@
-"""What a broker is told: the values by name, and how Home Assistant finds and shows them.
+"""Messages for a broker: the values by name, and the discovery message of Home Assistant.
 
-One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, with nothing in it: the
-broker keeps no number of a vehicle that is gone.
+One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, without values, so that
+the broker keeps no number of a vehicle that is gone.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from gz_onboard.dashboard.picture import ALERTS, Picture
 from gz_onboard.events import Activity, State
 
 ONLINE, OFFLINE = "online", "offline"
-NONE = "none"  # of alerts and reasons, when all is well
+NONE = "none"  # alert and reasons when all is well
 LONGEST = 255  # characters that Home Assistant takes as a state
-EXPIRES = 30  # s: a state that is older is no longer one of now, to the broker and to Home Assistant
+EXPIRES_S = 30  # after which the broker drops a state, and Home Assistant shows none
 PREFIX = "homeassistant"  # where it looks, unless it is configured otherwise
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """One value. kind: Home Assistant's device class; options: all that a text may be."""
+class SensorEntity:
+    """One value. kind: Home Assistant's device class; options: the possible texts."""
 
     name: str
     kind: str | None = None
     unit: str | None = None
     options: tuple[str, ...] = ()
-    digits: int | None = None  # that are shown
+    digits: int | None = None  # shown after the point
     diagnostic: bool = False
-    total: bool = False  # it only grows, so that Home Assistant can make days and months of it
+    total: bool = False  # only grows, so that Home Assistant can sum days and months
 
 
-def _km(name: str) -> Sensor:
-    return Sensor(name, "distance", "km", digits=1)
+def _km(name: str) -> SensorEntity:
+    return SensorEntity(name, "distance", "km", digits=1)
 
 
-def _degrees(name: str) -> Sensor:
-    return Sensor(name, "temperature", "°C", digits=0)
+def _degrees(name: str) -> SensorEntity:
+    return SensorEntity(name, "temperature", "°C", digits=0)
 
 
 def _names(members: type[State] | type[Activity]) -> tuple[str, ...]:
@@ -50,40 +50,40 @@ SENSORS = {
     "range": _km("Range"),
     "range_p10": _km("Range, surely (P10)"),
     "range_p90": _km("Range, at best (P90)"),
-    "state_of_charge": Sensor("State of charge", "battery", "%", digits=0),
-    "state_of_charge_sigma": Sensor("State of charge, sigma", None, "%", digits=1, diagnostic=True),
-    "energy_left": Sensor("Energy left", "energy_storage", "Wh", digits=0),
-    "consumption_recent": Sensor("Consumption of the last kilometre", "energy_distance", "Wh/km", digits=1),
-    "consumption_expected": Sensor("Consumption expected", "energy_distance", "Wh/km", digits=1),
-    "charge_power": Sensor("Charging power", "power", "W", digits=0),
-    "time_to_full": Sensor("Time until full", "duration", "min", digits=0),
+    "state_of_charge": SensorEntity("State of charge", "battery", "%", digits=0),
+    "state_of_charge_sigma": SensorEntity("State of charge, sigma", None, "%", digits=1, diagnostic=True),
+    "energy_left": SensorEntity("Energy left", "energy_storage", "Wh", digits=0),
+    "consumption_recent": SensorEntity("Consumption of the last kilometre", "energy_distance", "Wh/km", digits=1),
+    "consumption_expected": SensorEntity("Consumption expected", "energy_distance", "Wh/km", digits=1),
+    "charge_power": SensorEntity("Charging power", "power", "W", digits=0),
+    "time_to_full": SensorEntity("Time until full", "duration", "min", digits=0),
     "range_full": _km("Range when full"),
     "route_left": _km("Distance to the destination"),
-    "arrival_state_of_charge": Sensor("State of charge on arrival", "battery", "%", digits=0),
+    "arrival_state_of_charge": SensorEntity("State of charge on arrival", "battery", "%", digits=0),
     "rated_range": _km("Rated range"),
-    "odometer": Sensor("Odometer", "distance", "km", digits=0, total=True),
+    "odometer": SensorEntity("Odometer", "distance", "km", digits=0, total=True),
     "cell_temperature_coldest": _degrees("Coldest cell"),
     "cell_temperature_hottest": _degrees("Hottest cell"),
-    "activity": Sensor("Activity", "enum", options=_names(Activity)),
-    "state": Sensor("State of the estimate", "enum", options=_names(State)),
-    "alert": Sensor("Alert", "enum", options=(NONE, *ALERTS)),
-    "reasons": Sensor("Reasons", diagnostic=True),
+    "activity": SensorEntity("Activity", "enum", options=_names(Activity)),
+    "state": SensorEntity("State of the estimate", "enum", options=_names(State)),
+    "alert": SensorEntity("Alert", "enum", options=(NONE, *ALERTS)),
+    "reasons": SensorEntity("Reasons", diagnostic=True),
 }
-"""By the names that they have in the state."""
+"""By their names in the state."""
 
 
 def topic_of(name: str) -> str:
-    """Where the state of the vehicle `name` is."""
+    """Topic of the state of the vehicle `name`."""
     return f"gz-onboard/{name}/state"
 
 
 def discovery_topic(name: str) -> str:
-    """Where Home Assistant learns of it."""
+    """Topic of its discovery message."""
     return f"{PREFIX}/device/gz-onboard-{name}/config"
 
 
 def state_of(picture: Picture, status: str) -> dict[str, object]:
-    """The values of a picture by name, None for what is stale, not available or never came."""
+    """Return the values of a picture by name; None if stale, not available or never received."""
     charge, route, cells = picture.charge, picture.route, picture.cells
     return {
         "status": status,
@@ -112,19 +112,19 @@ def state_of(picture: Picture, status: str) -> dict[str, object]:
 
 
 def _joined(reasons: Sequence[str]) -> str:
-    """As many as fit into a state."""
+    """Join as many as fit into a state."""
     while len(text := ", ".join(reasons)) > LONGEST:
         reasons = reasons[:-1]
     return text or NONE
 
 
 def encoded(values: dict[str, object]) -> bytes:
-    """As one line of JSON."""
+    """Encode as one line of JSON."""
     return json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
 
 
 def discovery(name: str) -> dict[str, object]:
-    """What Home Assistant is told of the vehicle `name`: one device, and its sensors."""
+    """Return the discovery message for the vehicle `name`: one device with its sensors."""
     return {
         "device": {"identifiers": [f"gz-onboard-{name}"], "name": name, "manufacturer": "gz_onboard"},
         "origin": {"name": "gz-onboard", "sw_version": __version__},
@@ -133,8 +133,8 @@ def discovery(name: str) -> dict[str, object]:
     }
 
 
-def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
-    """A sensor, available only while somebody is there who says it, and while there is something to say."""
+def _component(name: str, key: str, sensor: SensorEntity) -> dict[str, object]:
+    """Describe a sensor, which is available only while the bridge is online and the value is known."""
     there = f"value_json.status == '{ONLINE}' and value_json.{key} is not none"
     about: dict[str, object] = {
         "platform": "sensor",
@@ -149,7 +149,7 @@ def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
                 "payload_not_available": OFFLINE,
             }
         ],
-        "expire_after": EXPIRES,
+        "expire_after": EXPIRES_S,
     }
     if sensor.kind:
         about["device_class"] = sensor.kind

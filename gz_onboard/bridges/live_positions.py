@@ -1,4 +1,4 @@
-"""Where the vehicle is, from its own frames on the bus: the range frames do not say it."""
+"""Positions of the vehicle, from its own frames on the bus: the range frames have none."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ROLES = *NEEDED, "gps_altitude", "gps_fix"
 
 
 class LivePositions:
-    """The positions in a vehicle's frames, as they come."""
+    """Reads the positions in a vehicle's frames."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         mapping = vehicle.mapping
         mapped = {source.role: source.message for source in mapping.sources if source.role in ROLES}
-        self.identifiers = identifiers_of(mapping, set(mapped.values()))  # of the frames that it needs
+        self.identifiers = identifiers_of(mapping, set(mapped.values()))
         self._codec = Codec(mapping)
         self._signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
@@ -33,12 +33,12 @@ class LivePositions:
 
     @staticmethod
     def lacking(vehicle: Vehicle) -> list[str]:
-        """The roles without which there are none."""
+        """Return the roles that the vehicle file would need to map."""
         mapped = {source.role for source in vehicle.mapping.sources}
         return [role for role in NEEDED if role not in mapped]
 
     def take(self, frames: Sequence[Frame]) -> Iterator[dict[str, Any]]:
-        """Take in frames, in the order of their times; gives each new position as a row."""
+        """Take in frames, in the order of their times; yield each new position as a row."""
         codec, signals = self._codec, self._signals
         for frame in frames:
             codec.decode([frame])

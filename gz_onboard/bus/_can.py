@@ -31,17 +31,13 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["NO_SOCKETS", "can", "check_interface", "flagged", "open_bus"]
+__all__ = ["can", "check_interface", "flagged", "open_bus"]
 
 MULTICAST = "udp_multicast"
 ALL_GROUPS = {
     socket.AF_INET: (socket.IPPROTO_IP, 49),
     socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
 }  # IP(V6)_MULTICAST_ALL
-NO_SOCKETS = (  # what EAFNOSUPPORT of socketcan means
-    "this kernel has no CAN sockets (AF_CAN): load them (sudo modprobe can_raw), or join processes without by "
-    "--interface udp_multicast --channel 239.74.163.2"
-)
 
 
 def check_interface(name: str) -> None:

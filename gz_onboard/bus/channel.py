@@ -1,45 +1,47 @@
-"""A CAN channel: python-can's bus, drained once for each tick instead of waking for each frame.
+"""A CAN channel, drained once for each tick of its reader instead of waking up for each frame.
 
-On SocketCAN the bus's own socket is read with the kernel's filters, time stamps and drop counter. What the kernel
-buffers between two ticks costs one wake-up, not hundreds: a fifth of the time of python-can's reader thread.
-A bus that goes down is closed and opened again until it is back; nothing here raises for it.
+A SocketCAN bus is read by its socket (`gz_onboard.bus.socketcan`), all others by python-can
+(`gz_onboard.bus.library_bus`), which is imported for them only: it costs 9 MB and a fifth of the daemon's start. A bus
+that goes down is closed, and reopened once it is back; nothing here raises for it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import socket
-import struct
 import time
-from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from gz_onboard.bus._can import MULTICAST, NO_SOCKETS, can, check_interface, flagged, open_bus
+from gz_onboard.bus.socketcan import NO_SOCKETS, SocketCanBus
 from gz_onboard.errors import InputError
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
+from gz_onboard.events import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-SO_TIMESTAMPNS = 35
-SO_RXQ_OVFL = 40
-SO_RCVBUFFORCE = 33
-BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 frames
-MOST, READ_S = 5000, 0.08
-"""Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
-RETRY = 1.0  # s between attempts to open a bus that is down
-ECHOING = (MULTICAST,)  # interfaces that give what is sent back to the sender
-ECHO_S = 2.0  # so long after it was sent
-_FRAME = struct.Struct("=IB3x8s")
-_FD_FRAME = struct.Struct("=IBB2x64s")
-_TIMESPEC = struct.Struct("=qq")
-_COUNT = struct.Struct("=I")
-_ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
+SOCKETCAN = "socketcan"
+MAX_FRAMES, READ_S = 5000, 0.08
+"""Frames, and time [s], that one call of `drain` takes at most; the kernel keeps the others, or drops them."""
+RETRY_S = 1.0  # between attempts to open a bus that is down
+
+
+class Bus(Protocol):
+    """An open bus. Its methods raise OSError if it has gone down."""
+
+    overflow: int  # frames that the kernel had to drop since it was opened
+
+    def drain(self, frames: list[Frame], index: int, limit: int, until: float) -> bool:
+        """Append the waiting frames, at most `limit`, until a monotonic time [s]; whether more may be waiting."""
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send a frame."""
+
+    def close(self) -> None:
+        """Close it."""
 
 
 class CanChannel:
-    """One channel. `index` is put into its frames; `identifiers` are all that the kernel shall let through."""
+    """One channel. index: is put into its frames; identifiers: the only ones to be received, if given."""
 
     def __init__(
         self, interface: str, channel: str, index: int = 0, identifiers: Sequence[int] | None = None, **options: Any
@@ -47,171 +49,74 @@ class CanChannel:
         self.interface = interface
         self.name = channel
         self.index = index
-        self.up = False
-        self.behind = False  # whether `drain` had no time for all that had come
-        self.overflow = 0  # frames that the kernel had to drop, as it counts them
+        self.behind = False  # whether `drain` had no time for all frames
         self.send_failures = 0
         self._identifiers = identifiers
-        self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
-        self._options = options
-        self._echoing = interface in ECHOING or bool(options.get("receive_own_messages"))
-        self._sent: deque[tuple[float, int, bytes]] = deque(
-            maxlen=1000
-        )  # time [s], identifier, data: that may come back
-        self._bus: Any = None
-        self._socket: socket.socket | None = None
-        self._kernel_count = 0
+        self._options = options  # for python-can
+        self._bus: Bus | None = None
+        self._overflow = 0  # of buses that were closed
         self._retry_at = 0.0
 
+    @property
+    def up(self) -> bool:
+        """Whether the bus is open."""
+        return self._bus is not None
+
+    @property
+    def overflow(self) -> int:
+        """Frames that the kernel had to drop, as it counts them."""
+        return self._overflow + (self._bus.overflow if self._bus else 0)
+
     def open(self) -> None:
-        """Open for the first time; InputError if there is no such interface or channel at all."""
-        check_interface(self.interface)
+        """Open for the first time; a bus that is down may come up later. InputError for an unknown interface."""
         try:
             self._open()
-        except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
-            raise InputError(f"--interface {self.interface}: {error}") from error
-        except (OSError, can.CanError) as error:
-            if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:
+        except OSError as error:
+            if self.interface == SOCKETCAN and error.errno == errno.EAFNOSUPPORT:
                 raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error
-            self._close()  # not there yet: a bus may come up later
+            self._close()
 
     def _open(self) -> None:
-        filters: list[dict[str, Any]] | None = None
-        if self._identifiers is not None and self.interface == "socketcan":
-            filters = [
-                {
-                    "can_id": i & 0x1FFFFFFF,
-                    "can_mask": 0x1FFFFFFF if i & EFF_FLAG else 0x7FF,
-                    "extended": bool(i & EFF_FLAG),
-                }
-                for i in self._identifiers
-            ]
-        bus: Any = open_bus(self.interface, self.name, can_filters=filters, **self._options)
-        self._bus = bus
-        raw = getattr(bus, "socket", None)
-        if self.interface == "socketcan" and isinstance(raw, socket.socket):
-            raw.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-            try:
-                raw.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER)
-            except OSError:  # needs CAP_NET_ADMIN; else as much as the system allows
-                raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-            self._socket = raw
-            self._kernel_count = 0
-        self.up = True
+        if self.interface == SOCKETCAN:
+            self._bus = SocketCanBus(self.name, self._identifiers)
+        else:
+            from gz_onboard.bus.library_bus import LibraryBus  # only here: a slow import
+
+            self._bus = LibraryBus(self.interface, self.name, self._identifiers, self._options)
 
     def _close(self) -> None:
-        self.up = False
-        self._socket = None
-        self._retry_at = time.monotonic() + RETRY
+        self._retry_at = time.monotonic() + RETRY_S
+        self._overflow = self.overflow
         bus, self._bus = self._bus, None
         if bus is not None:
-            with contextlib.suppress(OSError, can.CanError):
-                bus.shutdown()
-
-    def reopen(self) -> bool:
-        """If the channel is down and it is time to try again, try; True if it is up."""
-        if not self.up and time.monotonic() >= self._retry_at:
-            try:
-                self._open()
-            except (OSError, can.CanError, ValueError):
-                self._close()
-        return self.up
+            with contextlib.suppress(OSError):
+                bus.close()
 
     def drain(self) -> list[Frame]:
-        """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""
+        """Return the frames that have come since the last call, without waiting, within `READ_S` and `MAX_FRAMES`."""
         self.behind = False
-        if not self.up and not self.reopen():
-            return []
         frames: list[Frame] = []
         try:
-            if self._socket is not None:
-                self._drain_socket(self._socket, frames)
-            else:
-                self._drain_bus(frames)
-        except (OSError, can.CanError):  # ENETDOWN, ENODEV: what was read before is still good
+            if self._bus is None and time.monotonic() >= self._retry_at:
+                self._open()
+            if self._bus is not None:
+                self.behind = self._bus.drain(frames, self.index, MAX_FRAMES, time.monotonic() + READ_S)
+        except OSError:  # ENETDOWN, ENODEV: the frames read before are still good
             self._close()
         return frames
 
-    def _drain_socket(self, source: socket.socket, frames: list[Frame]) -> None:
-        receive, index, now = source.recvmsg, self.index, time.monotonic
-        flags = socket.MSG_DONTWAIT
-        unpack, unpack_time = _FRAME.unpack, _TIMESPEC.unpack
-        until = now() + READ_S
-        for number in range(MOST):
-            try:
-                data, ancillary, _, _ = receive(72, _ANCILLARY, flags)
-            except BlockingIOError:
-                return
-            time_ns = 0
-            for _level, kind, value in ancillary:
-                if kind == SO_TIMESTAMPNS:
-                    seconds, nanoseconds = unpack_time(value)
-                    time_ns = seconds * 1_000_000_000 + nanoseconds
-                elif kind == SO_RXQ_OVFL:
-                    count = _COUNT.unpack(value)[0]
-                    self.overflow += (count - self._kernel_count) & 0xFFFFFFFF
-                    self._kernel_count = count
-            if len(data) == 16:
-                identifier, length, payload = unpack(data)
-            else:
-                identifier, length, _, payload = _FD_FRAME.unpack(data)
-            if length < len(payload):
-                payload = payload[:length]
-            frames.append((time_ns or time.time_ns(), identifier, payload, index))
-            if not number & 31 and now() > until:
-                break
-        self.behind = True
-
-    def _drain_bus(self, frames: list[Frame]) -> None:
-        until = time.monotonic() + READ_S
-        for _ in range(MOST):
-            if time.monotonic() > until:
-                break
-            if (message := self._bus.recv(0)) is None:
-                return
-            identifier = flagged(message)
-            # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
-            if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
-                continue
-            data = bytes(message.data)
-            if self._sent and self._is_echo(identifier, data):
-                continue
-            # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
-            frames.append((time.time_ns(), identifier, data, self.index))
-        self.behind = True
-
-    def _is_echo(self, identifier: int, data: bytes) -> bool:
-        """Whether that is a frame of our own, which comes back once."""
-        now = time.monotonic()
-        while self._sent and now - self._sent[0][0] > ECHO_S:
-            self._sent.popleft()
-        for sent in self._sent:
-            if sent[1:] == (identifier, data):
-                self._sent.remove(sent)
-                return True
-        return False
-
     def send(self, frame: Frame) -> bool:
         """Send `frame`; False if the bus does not take it now."""
-        if not self.up:
+        if self._bus is None:
             return False
-        _, identifier, data, _ = frame
         try:
-            if self._socket is not None:
-                self._socket.send(_FRAME.pack(identifier, len(data), data), socket.MSG_DONTWAIT)
-            else:
-                extended = bool(identifier & EFF_FLAG)
-                self._bus.send(can.Message(arbitration_id=identifier & 0x1FFFFFFF, data=data, is_extended_id=extended))
-                if self._echoing:
-                    self._sent.append((time.monotonic(), identifier, data))
-            return True
-        except (OSError, can.CanError) as error:
+            self._bus.send(frame[1], frame[2])
+        except OSError as error:
             self.send_failures += 1
-            code = getattr(error, "errno", None) or getattr(error, "error_code", None)
-            if code not in (errno.ENOBUFS, errno.EAGAIN, None):
+            if error.errno not in (errno.ENOBUFS, errno.EAGAIN, None):
                 self._close()
             return False
+        return True
 
     def close(self) -> None:
         """Close for good."""

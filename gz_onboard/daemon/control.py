@@ -1,8 +1,8 @@
-"""The control socket: a navigation application on the same machine gives the daemon a route, or takes it away.
+"""The control socket, on which a navigation application on the same machine gives the daemon a route or clears it.
 
 A Unix stream socket. A request is one line of JSON, {"route": {...}}, {"route": null} or {"status": true}; so is the
-answer, {"ok": true, ...} or {"error": "..."}. Requests are read, checked and made ready on a thread of their own; the
-daemon's loop only takes what is ready. What is wrong changes nothing.
+answer, {"ok": true, ...} or {"error": "..."}. Each client has a thread, which checks the request and prepares the
+route; the daemon's loop only switches to it. A bad request changes nothing.
 """
 
 from __future__ import annotations
@@ -10,15 +10,13 @@ from __future__ import annotations
 import json
 import logging
 import os
-import socket
-import stat
+import socketserver
 import threading
-import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.estimator.route_ahead import Road
@@ -26,11 +24,9 @@ from gz_onboard.pipeline import Pipeline
 from gz_onboard.routes.columns import LEAST_ROWS, Columns
 from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
 
-MOST_BYTES = 8_000_000  # of a request: the most points with all columns have half of it
-SECONDS = 5.0  # for a request to come, and for its answer to be taken
-ACCESS = 0o660
-UMASK = 0o777 & ~ACCESS
-WAITING = 4  # clients
+MAX_REQUEST_BYTES = 8_000_000  # twice a route of the most points with all columns
+TIMEOUT_S = 5.0  # of each read and write
+UMASK = 0o777 & ~0o660
 LONGEST_NAME = 100
 REQUESTS = ("route", "status")
 
@@ -38,79 +34,53 @@ log = logging.getLogger("gz-onboard")
 
 
 class Control:
-    """Listens at `path` from `start` to `close`. pipeline: gives that of the daemon."""
+    """Listens at `path` from `start` to `close`. pipeline: returns the daemon's present one."""
 
     def __init__(self, path: Path | None, pipeline: Callable[[], Pipeline]) -> None:
         self._path, self._pipeline = path, pipeline
-        self._ready: SimpleQueue[Road | None] = SimpleQueue()  # for the loop to take
+        self._ready: SimpleQueue[Road | None] = SimpleQueue()  # for the daemon's loop to take
         self._name: str | None = None
-        self._socket: socket.socket | None = None
-        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._server: _Server | None = None
 
     def start(self) -> None:
-        """Listen, if there is a path. InputError if it cannot be."""
+        """Listen, if there is a path. InputError if that is impossible."""
         if self._path is None:
             return
-        _free(self._path)
-        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        before = os.umask(UMASK)  # so that it is nobody else's for no moment
+        before = os.umask(UMASK)  # the socket is never accessible to others, not even for a moment
         try:
-            listening.bind(str(self._path))
+            if self._path.is_socket():  # of a daemon that has crashed: a running one holds the bus
+                self._path.unlink()
+            self._server = _Server(str(self._path), self.answer)
         except OSError as error:
-            listening.close()
             raise InputError(f"{self._path}: cannot listen there: {error.strerror or error}") from error
         finally:
             os.umask(before)
-        listening.listen(WAITING)
-        self._socket = listening
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, name="control", daemon=True).start()
 
     def give(self, route: Route | None) -> None:
-        """Make `route` ready, which may take seconds, and have the loop take it; in any thread."""
+        """Prepare `route`, which may take seconds, for the daemon's loop to take; in any thread."""
         road = self._pipeline().estimator.ahead.ready(route) if route else None
         self._name = route.name if route else None
         self._ready.put(road)
 
     def take(self) -> None:
-        """In the loop: have what is ready followed from now on."""
+        """Switch to the newest prepared route; called by the daemon's loop."""
         while not self._ready.empty():
             road = self._ready.get_nowait()
             self._pipeline().estimator.ahead.follow(road)
             log.info("route %s", "given" if road else "cleared")
 
     def close(self) -> None:
-        """Listen no more."""
-        if self._socket and self._path:
-            with suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)  # ends the wait for a client
-            self._socket.close()
+        """Stop listening."""
+        if self._server and self._path:
+            self._server.shutdown()
+            self._server.server_close()
             self._path.unlink(missing_ok=True)
 
-    def _serve(self) -> None:
-        assert self._socket
-        while True:
-            try:
-                client, _ = self._socket.accept()
-            except OSError:  # closed
-                return
-            with client:
-                try:
-                    answer = self.answer(_line(client))
-                except InputError as error:
-                    answer = {"error": str(error)}
-                except OSError:
-                    continue
-                except Exception as error:  # the next client is to be heard, whatever this one sent
-                    log.exception("control socket")
-                    answer = {"error": f"failed: {error!r}"}
-                with suppress(OSError):
-                    client.settimeout(SECONDS)
-                    client.sendall(json.dumps(answer).encode() + b"\n")
-
     def answer(self, line: bytes) -> dict[str, object]:
-        """The answer to a request. InputError if it is none."""
+        """Carry out a request and return the answer. InputError for a bad request."""
         try:
-            request = json.loads(line)
+            request = json.loads(line, parse_int=float)  # a float cannot have thousands of digits
         except (ValueError, RecursionError) as error:
             raise InputError(f"is not JSON: {error}") from error
         if not isinstance(request, dict) or len(request) != 1 or next(iter(request)) not in REQUESTS:
@@ -126,97 +96,84 @@ class Control:
         return {"ok": True, "route": route.name, "length_m": round(route.length), "grade_known": route.grade_known}
 
     def _status(self) -> dict[str, object]:
-        e = self._pipeline().last
-        if e is None:
+        last = self._pipeline().last
+        if last is None:
             return {"route": self._name, "state": "NONE"}
         return {
             "route": self._name,
-            "state": e.route_state.name,
-            "along_m": e.route_along,
-            "left_m": e.route_left,
-            "energy_j": e.route_energy,
-            "arrival_soc": e.arrival_soc,
-            "arrival_soc_p10": e.arrival_soc_p10,
-            "arrival_soc_p90": e.arrival_soc_p90,
-            "battery_ends_after_m": e.battery_ends_after,
-            "battery_ends_latitude": e.battery_ends_latitude,
-            "battery_ends_longitude": e.battery_ends_longitude,
-            "range_m": e.range,
+            "state": last.route_state.name,
+            "along_m": last.route_along,
+            "left_m": last.route_left,
+            "energy_j": last.route_energy,
+            "arrival_soc": last.arrival_soc,
+            "arrival_soc_p10": last.arrival_soc_p10,
+            "arrival_soc_p90": last.arrival_soc_p90,
+            "battery_ends_after_m": last.battery_ends_after,
+            "battery_ends_latitude": last.battery_ends_latitude,
+            "battery_ends_longitude": last.battery_ends_longitude,
+            "range_m": last.range,
         }
 
 
-def route_of_request(request: object) -> Route:
-    """The route in a request: an object of lists of numbers, named as the columns of a CSV, and perhaps a ``name``.
+class _Server(socketserver.ThreadingUnixStreamServer):
+    """Passes each request line to `answer`."""
 
-    InputError that names list and point.
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, path: str, answer: Callable[[bytes], dict[str, object]]) -> None:
+        self.answer = answer
+        super().__init__(path, _Client)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore clients that stall or go away."""
+
+
+class _Client(socketserver.StreamRequestHandler):
+    """One connection, for one request."""
+
+    server: _Server
+    timeout = TIMEOUT_S
+
+    def handle(self) -> None:
+        line = self.rfile.readline(MAX_REQUEST_BYTES + 1)
+        try:
+            if len(line) > MAX_REQUEST_BYTES:
+                raise InputError(f"is longer than {MAX_REQUEST_BYTES} bytes")
+            answer = self.server.answer(line)
+        except InputError as error:
+            answer = {"error": str(error)}
+        except Exception as error:  # the client learns that its request was not carried out
+            log.exception("control socket")
+            answer = {"error": f"failed: {error!r}"}
+        self.wfile.write(json.dumps(answer).encode() + b"\n")
+
+
+def route_of_request(request: object) -> Route:
+    """Read the route in a request: an object of lists of numbers, named as the columns of a CSV, and maybe a ``name``.
+
+    InputError names list and point.
     """
     if not isinstance(request, Mapping):
         raise InputError(f"route: must be an object of lists or null, is {shown(request)}")
-    name = request.get("name", "route")
+    columns = dict(request)
+    name = columns.pop("name", "route")
     if not isinstance(name, str) or len(name) > LONGEST_NAME:
         raise InputError(f"route: name: must be a text of at most {LONGEST_NAME} letters, is {shown(name)}")
-    values: dict[str, tuple[float, ...]] = {}
-    for column, numbers in request.items():
-        if column == "name":
-            continue
+    for column, numbers in columns.items():
         if column not in KNOWN_AHEAD:
             known = ", ".join(KNOWN_AHEAD)
             raise InputError(f"route: unknown list {shown(column)}{nearest(column, KNOWN_AHEAD)}; known are {known}")
         if not isinstance(numbers, list):
             raise InputError(f"route: {column}: must be a list of numbers, is {shown(numbers)}")
-        values[column] = tuple(_number(column, point, x) for point, x in enumerate(numbers, start=1))
-    lengths = {column: len(numbers) for column, numbers in values.items()}
+        for point, number in enumerate(numbers, start=1):
+            if not isinstance(number, float) or not isfinite(number):
+                raise InputError(f"route, point:{point}: {column}: must be a finite number, is {shown(number)}")
+    lengths = {column: len(numbers) for column, numbers in columns.items()}
     if len(set(lengths.values())) > 1:
         raise InputError(f"route: its lists must be of one length, are {shown(lengths)}")
     count = min(lengths.values(), default=0)
     if count < LEAST_ROWS:
         raise InputError(f"route: has {count} points, must have at least {LEAST_ROWS}")
+    values = {column: tuple(numbers) for column, numbers in columns.items()}
     return route_ahead_of(Columns(Path("route, point"), tuple(range(1, count + 1)), values), name)
-
-
-def _number(column: str, point: int, value: object) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = float("inf")
-        if isfinite(number):
-            return number
-    raise InputError(f"route, point:{point}: {column}: must be a finite number, is {shown(value)}")
-
-
-def _line(client: socket.socket) -> bytes:
-    """The line that comes, within limits of size and time. InputError if none does."""
-    until, got = time.monotonic() + SECONDS, bytearray()
-    while (left := until - time.monotonic()) > 0:
-        client.settimeout(left)
-        try:
-            part = client.recv(65536)
-        except TimeoutError:
-            break
-        got += part
-        if (end := got.find(b"\n", max(len(got) - len(part), 0))) >= 0:
-            return bytes(got[:end])
-        if not part:
-            return bytes(got)
-        if len(got) > MOST_BYTES:
-            raise InputError(f"is longer than {MOST_BYTES} bytes")
-    raise InputError(f"did not end with a line break within {SECONDS:g} s")
-
-
-def _free(path: Path) -> None:
-    """Remove the socket of a daemon that is gone. InputError if `path` is anything else."""
-    try:
-        if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path}: is not a socket, and was left alone")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
-            other.settimeout(1.0)
-            other.connect(str(path))
-    except FileNotFoundError:
-        return
-    except ConnectionRefusedError:
-        path.unlink(missing_ok=True)
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot listen there: {error.strerror or error}") from error
-    raise InputError(f"{path}: another gz-onboard run listens there; give each its own")

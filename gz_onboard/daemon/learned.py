@@ -1,7 +1,4 @@
-"""``gz-onboard learned``: what the daemon has learned of a vehicle and its riders, and keeps in its state file.
-
-Shown as text or JSON; forgotten on request.
-"""
+"""``gz-onboard learned``: show or reset the daemon's knowledge of a vehicle and its riders."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from math import sqrt
@@ -21,176 +18,157 @@ from typing import Any
 from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, writing
-from gz_onboard.estimator.ageing import Ageing, Learned
-from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.estimator.snapshot import part, unlike
-from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain
-from gz_onboard.estimator.usual import Habit, Usual
-from gz_onboard.estimator.weakest import Weakest
+from gz_onboard.estimator.ageing import Learned
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.snapshot import check_vehicle
+from gz_onboard.estimator.terrain import RATE, STRETCH
+from gz_onboard.estimator.usual import Usual
 from gz_onboard.options import add_shared
+from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-VERSION = 3  # of the JSON keys
-USUAL_FOLDER = Path("/var/lib/gz-onboard")
-MEANING = {  # by name: what its factor is on
-    "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
-    "resistance": "of the cells, over the vehicle file's R0, R1 and quick effects in the cells",
-    "weak_charge": "of the weakest group of cells, over the mean cell's, when that is full",
-    "weak_capacity": "of that group, over the mean cell's",
-    "weak_resistance": "of that group, over the mean cell's",
-    "price": "energy of a kilometre in motion, over the prior riding's in the vehicle file",
-    "standing": "energy at stops, likewise",
-    "pace": "time of a kilometre, likewise",
+JSON_VERSION = 4
+STATE_FOLDER = Path("/var/lib/gz-onboard")
+MEANING = {  # by name: what its factor is relative to
+    "capacity": "capacity of the pack, relative to cell_capacity in the vehicle file",
+    "resistance": "resistance of the cells, relative to R0 and R1 in the vehicle file",
+    "weak_charge": "charge of the weakest group of cells when full, relative to the mean cell",
+    "weak_capacity": "capacity of the weakest group, relative to the mean cell",
+    "weak_resistance": "resistance of the weakest group, relative to the mean cell",
+    "price": "energy per kilometre in motion, relative to the prior in the vehicle file",
+    "standing": "energy at stops, relative to the prior",
+    "pace": "time per kilometre, relative to the prior",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": f"how far {STRETCH / 1000:.0f} km of road end above or below their begin, whoever rides, "
-    f"over the {sqrt(STRETCH * RATE):.0f} m expected before the first ride",
+    "terrain": f"change of height over {STRETCH / 1000:.0f} km of road, relative to the {sqrt(STRETCH * RATE):.0f} m "
+    "expected before the first ride",
 }
 TERRAIN = "terrain"
-LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
-ANEW = "; to begin anew, give `gz-onboard estimate --state` a new name; the daemon does so by itself when it starts"
-BY_RESISTANCE = "; what the resistance tells of it stays: `--reset battery` forgets both"
-BATTERY, RIDING = ("capacity", "resistance", "weakest"), "riding"
-FORGOTTEN = {  # by the word of --reset: what it forgets
-    **{name: (name,) for name in BATTERY},
-    "battery": BATTERY,
-    RIDING: (RIDING,),
-    "all": (*BATTERY, RIDING),
-}
-PARTS = {  # what --reset says of each
-    "capacity": "capacity of the battery",
-    "resistance": "resistance of the battery",
-    "weakest": "weakest group of cells",
-    RIDING: "riding of all riders, and terrain",
-}
-LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
+RESETS = {"battery": ("battery",), "riding": ("riding",), "all": ("battery", "riding")}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of the command."""
     add_shared(parser, "--vehicle", "--vehicle-id", "--json")
-    parser.add_argument(
-        "--state", type=Path, metavar="FILE", help=f"saved state (default: the vehicle's in {USUAL_FOLDER})"
-    )
-    parser.add_argument(
-        "--reset",
-        choices=tuple(FORGOTTEN),
-        help="forget this, as `battery` after a new one, or `all` for a new owner; the daemon must not run",
-    )
+    state_help = f"saved state (default: the vehicle's in {STATE_FOLDER})"
+    parser.add_argument("--state", type=Path, metavar="FILE", help=state_help)
+    reset = "forget this: `battery` after the pack was replaced, `all` for a new owner; stop the daemon first"
+    parser.add_argument("--reset", choices=tuple(RESETS), help=reset)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show, or forget. InputError if the state cannot be read, is another vehicle's, or is in use."""
+    """Reset parts of a state, if asked for, and show it. InputError for a state that cannot be used."""
     vehicle = read_vehicle(arguments.vehicle, vehicle_id=arguments.vehicle_id)
-    file = arguments.state or state_file(USUAL_FOLDER, vehicle.name)
+    file = arguments.state or state_file(STATE_FOLDER, vehicle.name)
     not_an_input([arguments.json], [file, vehicle.file])
-    try:
-        snapshot, age = load(file, vehicle)
-    except InputError as error:
-        anew = ANEW if file.is_file() else ""
-        raise InputError(f"{error}; choose another with --state FILE or --vehicle NAME|TOML{anew}") from error
     if arguments.reset:
-        snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
-        forgotten = ", ".join(PARTS[name] for name in FORGOTTEN[arguments.reset])
-        forgotten += BY_RESISTANCE if arguments.reset == "capacity" else ""
-        # with the JSON on standard output it would be no JSON
-        print(f"reset in {file}: {forgotten}", file=sys.stderr if arguments.json == "-" else sys.stdout)
-    with _or_forget(file, "battery"):
-        learned = read_learned(vehicle, snapshot)
-    with _or_forget(file, RIDING):
-        riders = read_riders(vehicle, snapshot)
+        reset(file, vehicle, arguments.reset)
+        # not among the JSON on standard output
+        print(f"reset in {file}: {arguments.reset}", file=sys.stderr if arguments.json == "-" else sys.stdout)
+    estimator, age = read_state(file, vehicle)
+    battery, riders = battery_learned(estimator), riders_learned(estimator)
     if arguments.json:
-        rows = {"learned": _rows(learned), "riders": {name: _rows(x) for name, x in riders.items()}}
-        text = json.dumps({"version": VERSION, "vehicle": vehicle.key, "age_s": age, **rows}, indent=1)
+        rows = {"learned": _rows(battery), "riders": {name: _rows(found) for name, found in riders.items()}}
+        text = json.dumps({"version": JSON_VERSION, "vehicle": vehicle.key, "age_s": age, **rows}, indent=1)
         if arguments.json == "-":
             print(text)
             return OK
         with writing(arguments.json):
             Path(arguments.json).write_text(text + "\n", encoding="utf-8")
-    print(learned_text(learned, riders))
+    print(learned_text(battery, riders))
     return OK
 
 
-def learned_text(learned: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
-    """For a terminal. Terrain belongs to the roads; an unknown rider is left out if nothing is known of him."""
-    lines = [LEARNED, *(_line(name, x) for name, x in learned.items())]
+def read_state(file: Path, vehicle: Vehicle) -> tuple[Estimator, float | None]:
+    """Restore an estimator from a saved state; also its age by the clock [s], if known. InputError if it cannot be."""
+    estimator = Pipeline(vehicle).estimator
+    with _usable(file):
+        snapshot, age = _load(file)
+        estimator.restore(snapshot, vehicle.key, age)
+    return estimator, age
+
+
+def reset(file: Path, vehicle: Vehicle, what: str) -> None:
+    """Replace parts of a saved state, one of `RESETS`, by those of a new estimator; the state gets no younger."""
+    new = Pipeline(vehicle).estimator
+    with _usable(file):
+        snapshot, age = _load(file)
+        check_vehicle(snapshot, vehicle.key)
+    fresh = {"battery": {"learned": new.learned_snapshot()}, "riding": {"riding": new.riding_snapshot()}}
+    changed = dict(snapshot)
+    for part in RESETS[what]:
+        changed |= fresh[part]
+    with writing(file):
+        folder = os.open(state.copies(file)[0].parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            state.write(file, state.encode(changed, 0.0 if age is None else time.time() - age))
+        except BlockingIOError as error:
+            raise InputError(f"{file}: the running daemon would overwrite it; stop it first") from error
+        finally:
+            os.close(folder)
+
+
+def _load(file: Path) -> tuple[Mapping[str, Any], float | None]:
+    """Snapshot and age [s] of a state. ValueError if there is none, or if it is damaged."""
+    found = state.load(file, time.time())
+    if found is None:
+        raise ValueError("no saved state; the daemon keeps one in its state folder")
+    return found
+
+
+@contextmanager
+def _usable(file: Path) -> Iterator[None]:
+    """InputError, which names the `file` and what to do, for a state that cannot be used."""
+    try:
+        yield
+    except ValueError as error:
+        hint = "choose another with --state FILE or --vehicle NAME|TOML"
+        raise InputError(f"{file}: {error}; {hint}") from error
+
+
+def battery_learned(estimator: Estimator) -> dict[str, Learned]:
+    """Return the learned battery, by name; the weakest group only if its voltage is on the bus."""
+    return estimator.soc.ageing.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
+
+
+def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
+    """Return the learned habits by rider and name; the last rider, whose part has the terrain, comes first."""
+    forecaster = estimator.forecaster
+    prior, terrain = forecaster.prior, forecaster.terrain
+    riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
+    found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
+    ratio = sqrt(terrain.rate / RATE)
+    found[forecaster.riders.now][TERRAIN] = Learned(ratio, terrain.relative_sd * ratio, terrain.share)
+    return found
+
+
+def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
+    learned = {}
+    for field in fields(Usual):
+        habit, before = getattr(usual, field.name), getattr(prior, field.name)
+        sd, unknown = sqrt(habit.usual_variance), sqrt(before.usual_variance)
+        learned[field.name] = Learned(habit.usual / before.usual, sd / before.usual, max(1 - sd / unknown, 0.0))
+    return learned
+
+
+def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
+    """Describe the learned battery and riders for a terminal; an unnamed rider only if something is known."""
+    lines = ["per cent learned: share of the initial uncertainty that is gone"]
+    lines += [_line(name, x) for name, x in battery.items()]
     lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]
     for rider, found in riders.items():
         habits = {name: x for name, x in found.items() if name != TERRAIN}
         if len(riders) > 1:
             if not rider and not any(x.share for x in habits.values()):
                 continue
-            lines.append(f"rider {rider}:" if rider else "rides of which nobody said who rode:")
+            lines.append(f"rider {rider}:" if rider else "rides without a known rider:")
         lines += [_line(name, x) for name, x in habits.items()]
     return "\n".join(lines)
 
 
-def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
-    """What a saved state holds of the battery, by name. ValueError if it cannot be."""
-    ageing = Ageing(vehicle.pack.own())
-    with part("capacity or resistance"):
-        ageing.restore(snapshot.get("learned", {}))
-    return ageing.learned() | _of_weakest(vehicle, snapshot)
-
-
-def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
-    if all(source.role != LOWEST for source in vehicle.mapping.sources):
-        return {}
-    weakest = Weakest(vehicle.pack.own(), Signals([(LOWEST, DEFAULT_STALE)]), vehicle.parameters)
-    with part("weakest"):
-        weakest.take_on(weakest.read(snapshot.get("learned", {}).get("weakest")))
-    return weakest.learned()
-
-
-def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
-    """What a saved state holds of the riding, by rider and name; who rode last comes first. ValueError likewise."""
-    forecaster = _fresh(vehicle)
-    prior = forecaster.prior
-    with part(RIDING):
-        forecaster.restore(snapshot["riding"])
-    now = forecaster.riders.now
-    riders = {now: forecaster.riding.usual, **forecaster.riders.others}
-    found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
-    found[now][TERRAIN] = _of_terrain(forecaster.terrain)
-    return found
-
-
-def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
-    names = [field.name for field in fields(Usual)]
-    return {name: _of_habit(getattr(usual, name), getattr(prior, name)) for name in names}
-
-
-def _of_habit(habit: Habit, prior: Habit) -> Learned:
-    sd, unknown = sqrt(habit.usual_variance), sqrt(prior.usual_variance)
-    return Learned(habit.usual / prior.usual, sd / prior.usual, max(1 - sd / unknown, 0.0))
-
-
-def _of_terrain(terrain: Terrain) -> Learned:
-    return Learned(sqrt(terrain.rate / RATE), terrain.relative_sd * sqrt(terrain.rate / RATE), terrain.share)
-
-
-def _fresh(vehicle: Vehicle) -> Forecaster:
-    """That has learned nothing."""
-    return Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
-
-
-@contextmanager
-def sound(file: Path) -> Iterator[None]:
-    """InputError, which names the `file`, for a saved state that holds what cannot be."""
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(f"{file}: {error}") from error
-
-
-@contextmanager
-def _or_forget(file: Path, word: str) -> Iterator[None]:
-    """As `sound`, of the part that --reset forgets by `word`: how that is begun anew."""
-    try:
-        with sound(file):
-            yield
-    except InputError as error:
-        raise InputError(f"{error}; --reset {word} begins that anew, --reset all everything") from error
+def _line(name: str, x: Learned) -> str:
+    share = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
+    return f"{name:15} {x.value:5.3f} ± {x.sd:5.3f}  {share}: {MEANING[name]}"
 
 
 def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
@@ -198,44 +176,3 @@ def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
         name: {"factor": x.value, "sd": x.sd, "percent_learned": round(100 * x.share), "of": MEANING[name]}
         for name, x in learned.items()
     }
-
-
-def _line(name: str, x: Learned) -> str:
-    known = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
-    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {known}: {MEANING[name]}"
-
-
-def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
-    """(snapshot, its age by the clock [s] if known). InputError for a state that is missing, or another vehicle's."""
-    with sound(file):
-        found = state.load(file, time.time())
-    if found is None:
-        raise InputError(f"{file}: no saved state; the daemon keeps one in its state folder")
-    with sound(file), part("state"):
-        key = found[0].get("key")
-    if key != vehicle.key:
-        raise InputError(f"{file}: {unlike(key, vehicle.key)}")
-    return found
-
-
-def _forget(
-    file: Path, snapshot: Mapping[str, Any], age: float | None, names: Collection[str], fresh: Forecaster
-) -> Mapping[str, Any]:
-    """The state without what was learned under `names`, as it is saved from now on, no younger than it was."""
-    learned = snapshot.get("learned")
-    kept = {name: x for name, x in learned.items() if name not in names} if isinstance(learned, Mapping) else {}
-    changed = {**snapshot, "learned": kept}
-    if RIDING in names:
-        changed["riding"] = fresh.snapshot()
-    with sound(file):
-        text = state.encode(changed, 0.0 if age is None else time.time() - age)
-    with writing(file):
-        descriptor = os.open(state.target(file).parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            state.write(file, text)
-        except BlockingIOError as error:
-            raise InputError(f"{file}: the running daemon would overwrite it; stop it first") from error
-        finally:
-            os.close(descriptor)
-    return changed

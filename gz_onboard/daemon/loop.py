@@ -10,7 +10,7 @@ import logging
 import time
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,13 @@ from gz_onboard.log_rows import reason_names
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle
 
-TICK = 0.1  # s: as often as a status is sent; each wake-up costs as much as ten frames
-BUSY = 200  # frames in a tick from which the next is half as long: what waits in the kernel must fit its buffer
+TICK = 0.1  # s, the period of the status frame; a wake-up costs as much as ten frames
+BUSY = 200  # frames in a tick after which the next is half as long, so that the kernel's buffer does not overflow
 WORK_S = 0.06  # s of CPU that the frames of one tick may cost
-FRAME_S = 20e-6  # s of CPU for a frame, until it is measured
-STOP_S = 6.0  # to write what waits when stopped; systemd kills after 10 s
+FRAME_S = 20e-6  # s of CPU per frame, until it is measured
+STOP_S = 6.0  # s to finish writing when stopped; systemd kills after 10 s
 CLOCK_STEP_NS = 500_000_000
-HELD_NS = 200_000_000  # so long a channel waits for another that could not be read out
+HELD_NS = 200_000_000  # a channel waits no longer for another that could not be read out
 
 log = logging.getLogger("gz-onboard")
 
@@ -46,32 +46,30 @@ class Daemon:
         channels: list[CanChannel],
         recorder: Recorder | None,
         state_file: Path | None,
+        *,
         filter_name: str = "scalar",
-        tick: float = TICK,
+        control_socket: Path | None = None,
+        rider: str = "",
     ) -> None:
-        self.channels = channels
-        self.recorder = recorder
-        self.control: Control | None = None
-        self.rider = ""  # if that is known
         self.finished = True  # whether log and state were written to their end
+        self.channels = channels
+        self._rider = rider
         self._log = BackgroundRecorder(recorder) if recorder else None
         self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
         self.pipeline = self._make_pipeline()
+        self.control = Control(control_socket, lambda: self.pipeline)
         self._keeper = StateKeeper(state_file, vehicle.key) if state_file else None
-        self._tick = tick
         self._stopping = False
-        self._later: list[Frame] = []
-        self._overrun = 0
+        self._later: list[Frame] = []  # read before their tick
+        self._overrun = 0  # frames left out
         self._frame_s = FRAME_S
         self._offset = _wall_offset()
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-        self._said_at = 0.0
-        self._said = ""
-        self._foreign = False  # it was said that someone else sends on our identifiers
-        self._log_error = ""
+        self._reported_at = 0.0
+        self._reported: dict[str, str] = {}  # by subject: the text that was last logged
 
     def stop(self, *_: object) -> None:
-        """End after the current round."""
+        """End after the present tick."""
         self._stopping = True
 
     def run(self) -> None:
@@ -82,7 +80,7 @@ class Daemon:
         try:
             self._loop()
             notify.stopping()
-            self.round()  # what waited for its tick
+            self.tick()  # frames that waited for theirs
         finally:
             self.close()
 
@@ -94,13 +92,13 @@ class Daemon:
         notify.ready("waiting for frames")
         log.info("ready after %.2f s of CPU", time.process_time())
         while not self._stopping:
-            next_tick += self._tick / 2 if busy else self._tick
+            next_tick += TICK / 2 if busy else TICK
             pause = next_tick - time.monotonic()
             if pause > 0:
                 time.sleep(pause)
             else:  # overloaded or suspended: do not try to catch up
                 next_tick -= pause
-            busy = self.round() > BUSY
+            busy = self.tick() > BUSY
             now = time.monotonic()
             if watchdog and now - fed >= watchdog:
                 fed = now
@@ -108,10 +106,9 @@ class Daemon:
             self._report(now)
 
     def close(self) -> None:
-        """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
+        """Save the state, finish the log as far as the disks allow in time, and close the channels."""
         until = time.monotonic() + STOP_S
-        if self.control:
-            self.control.close()
+        self.control.close()
         if self._keeper:
             self._keeper.save(self.pipeline, time.time_ns())
         if self._log and not self._log.close(until - time.monotonic()):
@@ -123,52 +120,51 @@ class Daemon:
         for channel in self.channels:
             channel.close()
 
-    def restore(self) -> dict[str, Any] | None:
-        """Go on from the latest saved state that can be used; gives it."""
+    def restore(self) -> Mapping[str, Any] | None:
+        """Continue from the latest saved state that can be used; return it."""
         snapshot = None
         if self._keeper:
             self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
-        if self.rider:  # whoever rode when it was saved
-            self.pipeline.estimator.ridden_by(self.rider)
+        if self._rider:  # not the one of the saved state
+            self.pipeline.estimator.ridden_by(self._rider)
         return snapshot
 
-    def round(self) -> int:
-        """One tick; gives the number of frames that came."""
+    def tick(self) -> int:
+        """Read and process the frames since the last tick; return their number."""
         boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frames, self._later = self._later, []
-        whole = []  # ns: until when the channels with more to read were read
+        read_until = []  # ns, of the channels with more to read
         for channel in self.channels:
             frames += (new := channel.drain())
-            whole += [new[-1][0]] if channel.behind and new else []
+            read_until += [new[-1][0]] if channel.behind and new else []
         offset = _wall_offset()
         now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
-        now_ns = max(min([now_ns, *whole]), now_ns - HELD_NS)
+        now_ns = max(min([now_ns, *read_until]), now_ns - HELD_NS)
         self.pipeline.estimator.wait((boot_ns - self._boot_ns) * 1e-9)
         self._boot_ns = boot_ns
-        # What came while we read, or were held up, waits for its own tick: of a channel read before, some is missing.
+        # Frames that came while we read wait for the next tick: some of a channel that was read earlier are missing.
         frames.sort(key=itemgetter(0))
         ahead = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + offset + CLOCK_STEP_NS  # for the codec to drop
         end, beyond = bisect_left(frames, (now_ns,)), bisect_left(frames, (ahead,))
         frames, self._later = frames[:end] + frames[beyond:], frames[end:beyond]
         step = offset - self._offset
         self._offset = offset
-        if abs(step) > CLOCK_STEP_NS:  # by the network's or the GPS' time; what came meanwhile has either time
+        if abs(step) > CLOCK_STEP_NS:  # the network or GPS set the clock; frames have the old or the new time
             log.warning("the clock was set by %.1f s", step * 1e-9)
             self.pipeline.clock_set(step)
             frames, self._later = [], []
-        count = len(frames)
         kept = fair_share(frames, max(int(WORK_S / self._frame_s), 2 * BUSY))
-        self._overrun += count - len(kept)
+        self._overrun += len(frames) - len(kept)
         began = time.thread_time()
         self.step(kept, now_ns)
         if len(kept) > BUSY:
             self._frame_s += 0.2 * ((time.thread_time() - began) / len(kept) - self._frame_s)
-        else:  # so few say nothing of a frame: it is the estimates that cost
+        else:  # with so few the estimates cost more than the frames
             self._frame_s = max(0.98 * self._frame_s, FRAME_S)
-        return count
+        return len(frames)
 
     def step(self, frames: list[Frame], now_ns: int) -> None:
-        """Take in frames, in the order of their times, up to `now_ns`; send, record and save what comes of them."""
+        """Process frames, in the order of their times, up to `now_ns`; send, record and save the results."""
         pipeline = self.pipeline
         pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
         pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
@@ -183,8 +179,7 @@ class Daemon:
         if self._keeper and self._keeper.failing:
             reasons |= Reason.SAVE_FAILED
         pipeline.extra_reasons = reasons
-        if self.control:
-            self.control.take()
+        self.control.take()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
         if self._log:
@@ -193,18 +188,16 @@ class Daemon:
             self._keeper.save_if_due(pipeline, now_ns)
 
     def _report(self, now: float) -> None:
-        """Give systemd the status and the journal what changed, at most once a second."""
-        if now - self._said_at < 1.0:
+        """Give systemd the status and log what changed, at most once a second."""
+        if now - self._reported_at < 1.0:
             return
-        self._said_at = now
+        self._reported_at = now
         error = self._log.last_error if self._log and self._log.failing else ""
-        if error and error != self._log_error:
+        if self._is_news("log", error):
             log.warning("cannot write the log: %s", error)
-        self._log_error = error
-        if self._keeper:
-            self._keeper.report()
-        if self.pipeline.foreign and not self._foreign:
-            self._foreign = True
+        if self._is_news("state", "stuck" if self._keeper and self._keeper.stuck else ""):
+            log.warning("cannot save the state: the disk does not answer")
+        if self._is_news("foreign", "foreign" if self.pipeline.foreign else ""):
             log.warning("%s", foreign_text(self.pipeline))
         last = self.pipeline.last
         if last is None:
@@ -212,31 +205,30 @@ class Daemon:
         counts = self.pipeline.counts()
         state, remaining, _, _ = self.pipeline.publisher.reported(last)
         text = state_text(state, last.reasons)
-        if text != self._said:
+        if self._is_news("estimate", text):
             log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
-            self._said = text
         if remaining is not None and last.soc is not None:
             text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
         notify.status(text)
 
+    def _is_news(self, subject: str, text: str) -> bool:
+        """Whether there is a `text` about `subject`, other than the last one."""
+        before, self._reported[subject] = self._reported.get(subject, ""), text
+        return bool(text) and text != before
+
 
 def foreign_text(pipeline: Pipeline) -> str:
-    """That someone else sends on the identifiers of our own frames, which does neither any good."""
+    """Warn of another sender on the identifiers of our own frames."""
     counted = ", ".join(f"{identifier} {count} times" for identifier, count in pipeline.foreign.items())
     return f"someone else sends on the identifiers of the range frames ({counted}): give others, by range_identifier"
 
 
 def fair_share(frames: list[Frame], most: int) -> list[Frame]:
-    """About `most` of the frames, the latest of each identifier: one that floods the bus takes no other's place."""
+    """Keep about `most` frames, the latest of each identifier, so that one that floods the bus displaces no other."""
     if len(frames) <= most:
         return frames
-    counts = Counter(itemgetter(1, 3)(frame) for frame in frames)
-    left = most
-    for done, count in enumerate(sorted(counts.values())):
-        share = max(left // (len(counts) - done), 1)
-        if count > share:
-            break
-        left -= count
+    identifiers = {(identifier, channel) for _, identifier, _, channel in frames}
+    share = max(most // len(identifiers), 1)
     taken: Counter[tuple[int, int]] = Counter()
     kept = []
     for frame in reversed(frames):
@@ -248,7 +240,7 @@ def fair_share(frames: list[Frame], most: int) -> list[Frame]:
 
 
 def _wall_offset() -> int:
-    """The wall clock less the time since boot, suspended or not [ns]: changes only when the clock is set."""
+    """Wall clock minus time since boot, suspended or not [ns]; changes only when the clock is set."""
     for _ in range(10):
         before, wall = time.clock_gettime_ns(time.CLOCK_BOOTTIME), time.time_ns()
         if time.clock_gettime_ns(time.CLOCK_BOOTTIME) - before < 1_000_000:  # else we were held up between the two
@@ -257,5 +249,5 @@ def _wall_offset() -> int:
 
 
 def state_text(state: State, reasons: Reason) -> str:
-    """A state with its reasons, on one line."""
+    """Describe a state with its reasons on one line."""
     return f"{state.name.lower()}: {' '.join(reason_names(reasons)) or 'all inputs there'}"

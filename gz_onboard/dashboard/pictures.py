@@ -1,13 +1,13 @@
-"""The loop that reads the bus and makes pictures of it, for whatever shows them: a page, a broker, Foxglove.
-
-The loop is all that makes pictures. If it hangs, none come, and who shows them says so instead of showing old ones.
-"""
+"""The loop that reads the bus and makes pictures of it, for the terminal, the page, a broker and Foxglove."""
 
 from __future__ import annotations
 
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from gz_onboard import notify
 from gz_onboard.bus.channel import CanChannel
@@ -16,12 +16,12 @@ from gz_onboard.dashboard.view import View
 from gz_onboard.events import Frame
 
 POLL = 0.05  # s
-AGE = 0.2  # s: without a frame the view is looked at so often, to see what has become stale
-AT_LEAST = 1.0  # s: a picture is made so often though nothing has changed; who shows it waits for it
+AGE = 0.2  # s between two looks at what has become stale, while no frame comes
+AT_LEAST = 1.0  # s between two pictures though nothing has changed; without one the loop hangs
 
 
 def clock() -> float:
-    """[s], also while the board sleeps: what came before is then old."""
+    """Time since boot [s], suspended or not: numbers from before the board slept are old."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -29,13 +29,12 @@ def pictures(
     view: View,
     channel: CanChannel,
     stopped: Callable[[], bool],
-    heard: Callable[[Sequence[Frame]], None] = lambda _: None,
+    on_frames: Callable[[Sequence[Frame]], None] = lambda _: None,
 ) -> Iterator[Picture]:
     """Drain the channel into the view until it is time to stop: a picture when it has changed, and each second.
 
-    heard: gets all frames that the channel lets through, before the picture that they change.
+    on_frames: gets all frames that the channel lets through, before the picture that they change.
     """
-    source = channel.name, channel.interface
     shown: Picture | None = None
     looked = given = fed = -math.inf
     interval = notify.watchdog_interval() or math.inf
@@ -45,10 +44,10 @@ def pictures(
         for frame in frames:
             view.take(frame, now)
         if frames:
-            heard(frames)
+            on_frames(frames)
         if frames or now - looked >= AGE:
             looked = now
-            new = picture(view, now, source, channel.up, shown.alerts if shown else ())
+            new = picture(view, now, (channel.name, channel.interface), channel.up, shown.alerts if shown else ())
             if new != shown or now - given >= AT_LEAST:
                 shown, given = new, now
                 yield new
@@ -56,3 +55,18 @@ def pictures(
             notify.alive()
             fed = now
         time.sleep(POLL)
+
+
+@contextmanager
+def until_signalled(duration: float | None = None) -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells when to stop: after `duration` [s], or at SIGINT, SIGTERM or SIGHUP."""
+    end = time.monotonic() + (duration or math.inf)
+    stopping = threading.Event()
+    in_front = threading.current_thread() is threading.main_thread()  # only there can signals be handled
+    wanted = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_front else ()
+    before = {number: signal.signal(number, lambda *_: stopping.set()) for number in wanted}
+    try:
+        yield lambda: stopping.is_set() or time.monotonic() >= end
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,97 +1,93 @@
-"""The dashboard as text: a screen, or one line."""
+"""A picture as text, for a terminal."""
 
 from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
-from gz_onboard.bus.publisher import reason_signal
-from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import KEEPING, NO_SENSOR, Reason, State, cause_words, words
+from gz_onboard.dashboard.picture import NEARLY_EMPTY, Charge, Picture, Range
+from gz_onboard.events import KEEPING, NO_SENSOR, Reason, cause_words, words
 
 
 @dataclass(frozen=True)
 class Style:
-    """How texts are drawn; without colour the texts themselves say everything."""
+    """Capabilities of the terminal; without colour the texts themselves say everything."""
 
     colour: bool
     unicode: bool
 
     def paint(self, text: str, codes: str) -> str:
-        """`text` in the colours of the ANSI codes."""
+        """Colour `text` by ANSI codes, in ASCII where the terminal has no more."""
+        text = text if self.unicode else text.translate(_ASCII)
         return f"\x1b[{codes}m{text}\x1b[0m" if self.colour and codes and text else text
-
-    def plain(self, text: str) -> str:
-        """`text` in ASCII, where the terminal has no more."""
-        return text if self.unicode else text.translate(_ASCII)
 
 
 _ASCII = str.maketrans({"–": "-", "±": "+-", "·": "|", "●": "O", "━": "=", "─": "-", "█": "#", "░": ".", "…": "~"})
-_BOLD, _DIM = "1", "2"
-_STATE_COLOURS = {State.STARTING: "36", State.VALID: "32", State.DEGRADED: "33", State.INVALID: "31"}
-_STATE_WORDS = {
-    State.STARTING: "starting: no estimate yet",
-    State.VALID: "valid",
-    State.DEGRADED: "degraded: an input is missing or doubtful, wider interval",
-    State.INVALID: "invalid: range unavailable",
+_BOLD, _DIM, _RED, _YELLOW = "1", "2", "31", "33"
+_STATES = {  # colour, and the words of the screen
+    "starting": ("36", "starting: no estimate yet"),
+    "valid": ("32", "valid"),
+    "degraded": (_YELLOW, "degraded: an input is missing or doubtful, wider interval"),
+    "invalid": (_RED, "invalid: range unavailable"),
 }
-
+_UNKNOWN = _DIM, "unknown"
 _WAITING = "waiting for the scooter"
 _NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"
+_KEEPING, _SENSORS = (frozenset(str(r.name).lower() for r in Reason if r in group) for group in (KEEPING, NO_SENSOR))
 
 Span = tuple[str, str]
 """(text, ANSI codes or nothing)"""
 Line = list[Span]
 
 
-def screen(view: View, now: float, source: str, width: int) -> list[Line]:
-    """The whole picture, at most `width` columns wide."""
+def screen(shown: Picture, source: str, width: int, comments: Mapping[str, str]) -> list[Line]:
+    """Lay out the whole picture, at most `width` columns wide. comments: explanations of reasons, by name."""
     room, width = width, max(min(width, 78), 24)
-    number = partial(_number, view, now)
-    state = view.state(now)
-    colour = _STATE_COLOURS[state] if state is not None else _DIM
-    if view.messages["RANGE_Estimate"].late(now):
-        colour = _DIM
-    interval = number("RANGE_RemainingP10"), (" to ", _DIM), number("RANGE_RemainingP90")
-    recent = number("RANGE_ConsumptionRecent"), (" over the last km", "")
-    trust = (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("unknown", _DIM)
+    colour, state = _STATES.get(shown.state or "", _UNKNOWN)
+    waiting = "waiting" in shown.alerts
+
+    def number(value: float | None, form: str, unit: str, message: str, codes: str = _BOLD) -> Span:
+        return _text(value, form, unit), _DIM if message in shown.late else codes
+
+    energy, level, ranges = "RANGE_Energy", shown.battery, shown.range
+    p10, p90 = (number(value, ".1f", "km", "RANGE_Estimate") for value in (ranges.p10_km, ranges.p90_km))
+    expected = number(shown.consumption.expected_wh_per_km, ".1f", "Wh/km", energy)
+    recent = number(shown.consumption.recent_wh_per_km, ".1f", "Wh/km", energy)
+    remaining = number(ranges.km, ".1f", "km", "RANGE_Estimate", f"{_BOLD};{colour}")
     lines: list[Line] = [
-        [(" gz-onboard", _BOLD), (f" · {source}", _DIM)],
+        [(" gz-onboard", _BOLD), (f" · {source}{'' if shown.bus_up else ' is down'}", _DIM)],
         [],
-        _row("Range", number("RANGE_Remaining", f"{_BOLD};{colour}"), ("     80 %: ", _DIM), *interval),
-        *_band(view, now, width, colour),
+        _row("Range", remaining, ("     80 %: ", _DIM), p10, (" to ", _DIM), p90),
+        *_band(ranges, width, _DIM if "RANGE_Estimate" in shown.late else colour),
         [],
-        _soc(view, now, width),
-        _row("Energy left", number("RANGE_EnergyLeft")),
-        _row("Consumption", number("RANGE_ConsumptionExpected"), (" expected, ", ""), *recent),
-        *_why(view, now),
-        [],
-        _row("State", (_WAITING, _BOLD) if view.waiting(now) else trust),
+        _state_of_charge(shown, width),
+        _row("Energy left", number(level.energy_left_wh, ".0f", "Wh", energy)),
+        _row("Consumption", expected, (" expected, ", ""), recent, (" over the last km", "")),
     ]
-    if activity := view.activity(now):
-        lines.append(_row("Activity", (activity, "")))
-    if charge := view.charge(now):
-        lines.append(_row("Charge", (charge, "")))
-    last = ""
-    for reason in sorted(_reasons(view, now), key=KEEPING.__contains__):
-        name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
-        label = "Note" if reason in KEEPING else "Wider interval" if state is State.VALID else "Because"
-        lines.append(_row("" if label == last else label, (name, "33")))
-        last = label
-        if len(name) + len(comment) + 24 <= width:
-            lines[-1].append((f": {comment.rstrip('.')}", _DIM))
-    left_out = ", ".join(words(role) for role in view.distrusted(now))
+    if causes := _causes(shown):
+        lines.append(_row("Why", (causes, _DIM if "RANGE_Why" in shown.late else "")))
+        lines.append(_row("", (f"besides the charge; rated {_text(shown.rated_km, '.1f', 'km')}", _DIM)))
+    lines += [[], _row("State", (_WAITING, _BOLD) if waiting else (state, f"{_BOLD};{colour}"))]
+    if shown.activity:
+        lines.append(_row("Activity", (shown.activity, "")))
+    if shown.charge:
+        lines.append(_row("Charge", (_charge(shown.charge), "")))
+    kept, others = _reasons(shown)
+    for label, reasons in ("Wider interval" if shown.state == "valid" else "Because", others), ("Note", kept):
+        for i, reason in enumerate(reasons):
+            name, comment = words(reason), comments.get(reason, "").rstrip(".")
+            fits = len(name) + len(comment) + 24 <= width
+            lines.append(_row("" if i else label, (name, _YELLOW), (f": {comment}" if comment and fits else "", _DIM)))
+    left_out = ", ".join(words(role) for role in shown.distrusted)
     for i, text in enumerate(textwrap.wrap(left_out, max(width - 20, 20))):
-        lines.append(_row("" if i else "Sensors left out", (text, "33")))
-    if math.isinf(view.age(now)):
-        lines += [_row("No frame of", (view.file.name, "31")), [(f"{'':20}{_NONE_YET}", _DIM)]]
-    else:
-        for i, (name, age) in enumerate(view.stale(now).items()):
-            how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
-            lines.append(_row("" if i else "Stale", (f"{name}: {how}", "31")))
-    lines += [[], *_counts(view, now)]
+        lines.append(_row("" if i else "Sensors left out", (text, _YELLOW)))
+    if not shown.heard:
+        lines += [_row("No frame of", (shown.file, _RED)), [(f"{'':20}{_NONE_YET}", _DIM)]]
+    elif shown.stale:
+        lines += [_row("" if i else "Stale", (name, _RED)) for i, name in enumerate(shown.stale)]
+    lines += [[], *_counts(shown)]
     return [_cropped(line, min(room, width)) for line in lines]
 
 
@@ -99,41 +95,39 @@ def _row(label: str, *spans: Span, codes: str = "") -> Line:
     return [(f"  {label:18}", codes), *spans]
 
 
-def _why(view: View, now: float) -> list[Line]:
-    """The largest causes; nothing where none is known."""
-    causes = causes_text(view, now)
-    if not causes:
-        return []
-    codes = _DIM if view.messages["RANGE_Why"].late(now) else ""
-    rated = f"besides the charge; rated {view.text('RANGE_WhyRated', now)}"
-    return [_row("Why", (causes, codes)), _row("", (rated, _DIM))]
+def _text(value: float | None, form: str, unit: str) -> str:
+    return "–" if value is None else f"{value:{form}} {unit}"
 
 
-def causes_text(view: View, now: float) -> str:
+def _causes(shown: Picture) -> str:
     """The largest causes in words, such as ``temperature -3.4 km, stops +1.2 km``."""
-    return ", ".join(f"{cause_words(cause.name)} {size:+.1f} km" for cause, size in view.why(now))
+    return ", ".join(f"{cause_words(cause.cause)} {cause.km:+.1f} km" for cause in shown.causes)
 
 
-def _reasons(view: View, now: float) -> list[Reason]:
-    """The reasons that are shown; without the scooter it goes without saying that its sensors are silent."""
-    hidden = NO_SENSOR if view.waiting(now) else Reason(0)
-    return [reason for reason in view.reasons(now) if reason not in hidden]
+def _charge(charge: Charge) -> str:
+    if charge.time_to_full_min is None:
+        return _text(charge.power_w, ".0f", "W")
+    hours, minutes = divmod(round(charge.time_to_full_min), 60)
+    time = f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+    full = _text(charge.range_full_km, ".1f", "km")
+    return f"{_text(charge.power_w, '.0f', 'W')}, full in {time}, {full} then"
 
 
-def _because(state: State | None) -> str:
-    """What reasons are said to be the cause of: they leave a valid estimate valid."""
-    known = "" if state is None else f"{state.name.lower()} "
-    return "wider interval" if state is State.VALID else f"{known}because"
+def _reasons(shown: Picture) -> tuple[Sequence[str], Sequence[str]]:
+    """(reasons that only concern logs and saved states, others); silent sensors go without saying while waiting."""
+    hidden = _SENSORS if "waiting" in shown.alerts else frozenset()
+    others = [reason for reason in shown.reasons if reason not in hidden | _KEEPING]
+    return [reason for reason in shown.reasons if reason in _KEEPING], others
 
 
-def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
-    """A bar from P10 to P90 on a scale from 0 km, with the range as a dot."""
-    p10, middle, p90 = (view.value(f"RANGE_Remaining{part}", now) for part in ("P10", "", "P90"))
+def _band(ranges: Range, width: int, colour: str) -> list[Line]:
+    """Draw a bar from P10 to P90 on a scale from 0 km, with the range as a dot."""
     cells = width - 4
-    if p10 is None or middle is None or p90 is None:
+    if ranges.p10_km is None or ranges.km is None or ranges.p90_km is None:
         return [[("  " + "─" * cells, _DIM)], []]
-    top = _scale_end(p90)
-    first, dot, last = (min(round(value / top * (cells - 1)), cells - 1) for value in (p10, middle, p90))
+    top = _scale_end(ranges.p90_km)
+    values = ranges.p10_km, ranges.km, ranges.p90_km
+    first, dot, last = (min(round(value / top * (cells - 1)), cells - 1) for value in values)
     bar: Line = [
         ("  " + "─" * first, _DIM),
         ("━" * (dot - first), colour),
@@ -141,8 +135,7 @@ def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
         ("━" * (last - dot), colour),
         ("─" * (cells - 1 - last), _DIM),
     ]
-    end = f"{top:g} km"
-    return [bar, [("  0" + end.rjust(cells - 1), _DIM)]]
+    return [bar, [("  0" + f"{top:g} km".rjust(cells - 1), _DIM)]]
 
 
 def _scale_end(value: float) -> float:
@@ -153,40 +146,29 @@ def _scale_end(value: float) -> float:
     return next(step * size for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * size >= value)
 
 
-def _number(view: View, now: float, name: str, codes: str = _BOLD) -> Span:
-    late = any(name in entry.limits and entry.late(now) for entry in view.messages.values())
-    return view.text(name, now), _DIM if late else codes
-
-
-def _soc(view: View, now: float, width: int) -> Line:
-    late = view.messages["RANGE_Status"].late(now)
-    soc, sigma = view.value("RANGE_StateOfCharge", now), view.value("RANGE_StateOfChargeSigma", now)
+def _state_of_charge(shown: Picture, width: int) -> Line:
+    late = "RANGE_Status" in shown.late
+    soc, sigma = shown.battery.soc_percent, shown.battery.soc_sigma_percent
     text = "–" if soc is None else f"{soc:.1f} %" if sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
     line = _row("State of charge", (f"{text:16}", _DIM if late else _BOLD))
     cells = min(width - 38, 36)
     if soc is not None and cells >= 10:
         full = min(max(round(soc / 100 * cells), 0), cells)
-        line += [("█" * full, _DIM if late else "32" if soc > NEARLY_EMPTY else "31"), ("░" * (cells - full), _DIM)]
+        line += [("█" * full, _DIM if late else "32" if soc > NEARLY_EMPTY else _RED), ("░" * (cells - full), _DIM)]
     return line
 
 
-def _counts(view: View, now: float) -> list[Line]:
-    entries = view.messages.values()
-    age = view.age(now)
-    last = "none yet" if math.isinf(age) else f"{age:.1f} s old" if age < 100 else f"{_duration(age)} old"
-    own = f"{last}, {sum(e.received for e in entries)} received, {sum(e.lost for e in entries)} lost"
-    bad = view.bad()
-    names = {"Dropped": "dropped", "Implausible": "implausible", "Lost": "lost", "Unknown": "unknown identifiers"}
-    counts = {word: view.value(f"RANGE_Count{name}", now) for name, word in names.items()}
-    known = [f"{value:.0f} {word}" for word, value in counts.items() if value is not None]
+def _counts(shown: Picture) -> list[Line]:
+    age, counts, vehicle = shown.age_s, shown.counts, shown.vehicle_counts
+    last = "none yet" if age is None else f"{age:.1f} s old" if age < 100 else f"{age / 60:.0f} min old"
+    own = f"{last}, {counts.received} received, {counts.lost} lost"
+    named = {"dropped": vehicle.dropped, "implausible": vehicle.implausible, "lost": vehicle.lost}
+    named["unknown identifiers"] = vehicle.unknown
+    known = [f"{value:.0f} {name}" for name, value in named.items() if value is not None]
     return [
-        _row("Range frames", (own, _DIM), (f", {bad} bad", "31" if bad else _DIM), codes=_DIM),
+        _row("Range frames", (own, _DIM), (f", {counts.bad} bad", _RED if counts.bad else _DIM), codes=_DIM),
         _row("Vehicle's frames", (", ".join(known) or "–", _DIM), codes=_DIM),
     ]
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
 def _cropped(line: Line, width: int) -> Line:
@@ -201,37 +183,5 @@ def _cropped(line: Line, width: int) -> Line:
 
 
 def rendered(line: Line, style: Style) -> str:
-    """A line as it goes to the terminal."""
-    return "".join(style.paint(style.plain(text), codes) for text, codes in line)
-
-
-def summary_line(view: View, now: float) -> str:
-    """Everything that matters on one line, for where there is no terminal."""
-    if math.isinf(view.age(now)):
-        bad = view.bad()
-        return f"no frame of {view.file.name}{f' but {bad} bad ones' if bad else ''}. {_NONE_YET}"
-    text = partial(view.text, now=now)
-    state = view.state(now)
-    parts = [
-        f"range {text('RANGE_Remaining')} ({text('RANGE_RemainingP10')} to {text('RANGE_RemainingP90')})",
-        f"SOC {text('RANGE_StateOfCharge')} ± {text('RANGE_StateOfChargeSigma')}",
-        f"{text('RANGE_EnergyLeft')} left",
-        f"{text('RANGE_ConsumptionRecent')} recent, {text('RANGE_ConsumptionExpected')} expected",
-        _WAITING if view.waiting(now) else state.name.lower() if state is not None else "state unknown",
-    ]
-    if activity := view.activity(now):
-        parts.append(activity)
-    if charge := view.charge(now):
-        parts.append(charge)
-    if causes := causes_text(view, now):
-        parts.append(f"why, besides charge: {causes}")
-    for what, names in (
-        (_because(state), [words(str(reason.name)) for reason in _reasons(view, now) if reason not in KEEPING]),
-        ("note", [words(str(reason.name)) for reason in _reasons(view, now) if reason in KEEPING]),
-        ("left out", [words(role) for role in view.distrusted(now)]),
-        ("stale", list(view.stale(now))),
-    ):
-        parts += [f"{what}: {', '.join(names)}"] if names else []
-    if bad := view.bad():
-        parts.append(f"{bad} bad range frames")
-    return "; ".join(parts)
+    """Turn a line into the text for the terminal."""
+    return "".join(style.paint(text, codes) for text, codes in line)

@@ -1,7 +1,7 @@
 """The page and its data over HTTP: static files, ``/api/latest``, and ``/api/stream`` of server-sent events.
 
-Everything is read-only. A thread for each connection, and few of them; each sends the newest picture and keeps none,
-so a slow browser costs no memory.
+Read-only. Each connection is for one request and has a thread; it sends the newest picture and keeps none, so a slow
+browser costs no memory.
 """
 
 from __future__ import annotations
@@ -9,20 +9,25 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import http.client
-import io
 import ipaddress
-import json
+import math
 import socket
+import socketserver
+import sys
 import threading
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.errors import InputError
+from gz_onboard import notify
+from gz_onboard.bus.channel import CanChannel
+from gz_onboard.dashboard.pictures import pictures, until_signalled
+from gz_onboard.dashboard.view import View
+from gz_onboard.errors import OK, InputError
 
 STATIC = Path(__file__).with_name("static")
 TYPES = {
@@ -31,11 +36,11 @@ TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-MOST_CONNECTIONS = 40  # a browser may keep six
-PATIENCE = 10.0  # s: for a request, and for a browser that takes nothing
-SEND_BUFFER = 32 << 10  # bytes in the kernel for each connection: it must not hold minutes of pictures
-OLDEST = 3.0  # s: a picture is made at least every second; older ones are of a bus loop that hangs
-RETRY_MS = 1000  # after which a browser asks again for a stream that broke
+MAX_CONNECTIONS = 40  # a browser may keep six
+TIMEOUT_S = 10.0  # for a request to arrive, and for a browser to take data
+SEND_BUFFER = 32 << 10  # bytes in the kernel for each connection, so that it does not hold minutes of pictures
+OLDEST_S = 3.0  # a picture is made at least every second; an older one means that the bus loop hangs
+RETRY_MS = 1000  # after which a browser reopens a broken stream
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
@@ -44,207 +49,123 @@ HEADERS = {
 }
 
 
-@dataclass
 class Feed:
     """The newest picture, encoded, for all connections."""
 
-    data: bytes = b"{}"
-    number: int = 0
-    time: float = 0.0  # s, monotonic
-    closed: bool = False
-    changed: threading.Condition = field(default_factory=threading.Condition)
+    def __init__(self) -> None:
+        self.number = 0
+        self._data = b""
+        self._time = -math.inf  # s, monotonic
+        self._closed = False
+        self._changed = threading.Condition()
 
     def publish(self, data: bytes) -> None:
-        """Give `data` to all who wait."""
-        with self.changed:
-            self.data, self.number, self.time = data, self.number + 1, time.monotonic()
-            self.changed.notify_all()
+        """Pass `data` to all waiting readers."""
+        with self._changed:
+            self._data, self.number, self._time = data, self.number + 1, time.monotonic()
+            self._changed.notify_all()
 
     def close(self) -> None:
-        """Let all who wait go."""
-        with self.changed:
-            self.closed = True
-            self.changed.notify_all()
+        """Release all waiting readers."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
-    def before(self) -> int:
-        """The number after which a new reader begins: it gets the newest picture only if that is of now."""
-        with self.changed:
-            return self.number - 1 if self._fresh() else self.number
+    def start(self) -> int:
+        """Return the number to pass to `after` first: a new reader gets the newest picture only if it is fresh."""
+        return self.number - 1 if time.monotonic() - self._time <= OLDEST_S else self.number
 
-    def after(self, number: int) -> tuple[int, bytes] | None:
-        """The newest picture, with its number, once it is newer than `number`; None if there will be none."""
-        with self.changed:
-            self.changed.wait_for(lambda: self.closed or self.number > number)
-            return None if self.closed else (self.number, self.data)
-
-    def latest(self) -> bytes | None:
-        """The newest picture, waiting for the first one; None if it is no longer of now."""
-        with self.changed:
-            self.changed.wait_for(lambda: self.closed or self.number > 0, OLDEST)
-            return self.data if self._fresh() else None
-
-    def _fresh(self) -> bool:
-        return self.number > 0 and not self.closed and time.monotonic() - self.time <= OLDEST
+    def after(self, number: int, timeout: float | None = None) -> tuple[int, bytes] | None:
+        """Return the newest picture and its number once it is newer than `number`; None if none comes."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self.number > number, timeout)
+            return None if self._closed or self.number <= number else (self.number, self._data)
 
 
-@dataclass(frozen=True)
-class Static:
-    """A file of the page."""
-
-    body: bytes
-    type: str
-    tag: str
-
-
-def static_files() -> dict[str, Static]:
-    """By the path of their address."""
-    files = {}
-    for path in sorted(STATIC.iterdir()):
-        if path.suffix in TYPES:
-            body = path.read_bytes()
-            name = "/" if path.name == "index.html" else f"/{path.name}"
-            files[name] = Static(body, TYPES[path.suffix], f'"{hashlib.sha256(body).hexdigest()[:16]}"')
-    return files
-
-
-def build_of(files: dict[str, Static]) -> str:
-    """What tells this page from another one."""
-    return hashlib.sha256("".join(file.tag for file in files.values()).encode()).hexdigest()[:16]
-
-
-class Server(ThreadingHTTPServer):
-    """Serves `feed` at `host` and `port`; OSError if that cannot be had."""
+class Server(socketserver.ThreadingTCPServer):
+    """Serves `feed` at `host` and `port`. OSError if it cannot listen there."""
 
     daemon_threads = True
     block_on_close = False
-    allow_reuse_port = False  # two on one port would share the browsers
+    allow_reuse_address = True
     request_queue_size = 16
 
     def __init__(self, host: str, port: int, feed: Feed) -> None:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         self.address_family = family
         self.feed = feed
-        self.files = static_files()
+        files = {path.name: path for path in sorted(STATIC.iterdir()) if path.suffix in TYPES}
+        self.files = {f"/{name}": (TYPES[path.suffix], path.read_bytes()) for name, path in files.items()}
+        self.files["/"] = self.files.pop("/index.html")
         self.build = build_of(self.files)
-        self._free = threading.Semaphore(MOST_CONNECTIONS)
+        self._free = threading.Semaphore(MAX_CONNECTIONS)
         super().__init__((str(address[0]), port), Handler)
-        self.local = ipaddress.ip_address(str(self.server_address[0]).partition("%")[0]).is_loopback
-
-    def server_bind(self) -> None:
-        """Bind, without asking a name server for our name as the base class does."""
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self.socket.bind(self.server_address)
-        self.server_address = self.socket.getsockname()
-        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
+        bound = ipaddress.ip_address(str(self.server_address[0]).partition("%")[0])
+        self.is_local = bound.is_loopback
+        name = socket.gethostname() if bound.is_unspecified else str(self.server_address[0])
+        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.server_address[1]}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve it on a thread of its own, or turn it away if there are too many."""
-        if not self._free.acquire(blocking=False):
-            with contextlib.suppress(OSError):
-                request.settimeout(0.1)
-                request.sendall(b"HTTP/1.1 503 Too many connections\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
-            self.shutdown_request(request)
-            return
-        try:
+        """Start a thread for the connection, or reject it if there are too many."""
+        if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
-        except RuntimeError:  # no thread can be had
-            self._free.release()
-            self.shutdown_request(request)
+            return
+        with contextlib.suppress(OSError):
+            request.settimeout(0.1)
+            request.sendall(b"HTTP/1.0 503 Too many connections\r\n\r\n")
+        self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """What the thread of a connection does."""
+        """Serve the connection, in its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Nothing: a browser that goes away is no error of ours."""
+        """Ignore browsers that go away."""
 
 
-class _Received(io.RawIOBase):
-    """What a client sends. TimeoutError once `seconds` have passed since the last `begin`, however it trickles in."""
-
-    def __init__(self, connection: socket.socket, seconds: float) -> None:
-        self._connection, self._seconds = connection, seconds
-        self.begin()
-
-    def begin(self) -> None:
-        """From now on the time counts."""
-        self._end = time.monotonic() + self._seconds
-
-    def readable(self) -> bool:
-        """As the base class has it."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """As the base class has it."""
-        left = self._end - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        self._connection.settimeout(left)
-        try:
-            return self._connection.recv_into(buffer)
-        finally:
-            self._connection.settimeout(self._seconds)
+def build_of(files: Mapping[str, tuple[str, bytes]]) -> str:
+    """Return a name of this version of the page; a browser that shows another one reloads it."""
+    return hashlib.sha256(b"".join(body for _, body in files.values())).hexdigest()[:16]
 
 
 class Handler(BaseHTTPRequestHandler):
     """One connection."""
 
     server: Server
-    protocol_version = "HTTP/1.1"
     server_version = "gz-onboard"
     sys_version = ""
-    timeout = PATIENCE  # of the socket, by the base class; also for all of a request's header
+    timeout = TIMEOUT_S
+    disable_nagle_algorithm = True
 
     def setup(self) -> None:
-        """Keep little in the kernel, and find out soon that nobody is there."""
+        """Limit the data that the kernel keeps for a slow browser."""
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):
-            self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(PATIENCE * 1000))
         super().setup()
-        self.rfile.close()
-        self._received = _Received(self.connection, self.timeout)
-        self.rfile = io.BufferedReader(self._received)
-
-    def handle_one_request(self) -> None:
-        """As the base class does, within the time."""
-        self._received.begin()
-        super().handle_one_request()
 
     def do_GET(self) -> None:
         """Answer."""
-        path = self.path.partition("?")[0]
-        if self._has_body():
-            self.close_connection = True  # or what is not read would be taken for another request
-            self._say(HTTPStatus.BAD_REQUEST, "There is nothing to send here.\n")
-        elif not self._addressed_to_us():
-            self._say(HTTPStatus.MISDIRECTED_REQUEST, "This is not the address of this dashboard.\n")
+        path, feed = self.path.partition("?")[0], self.server.feed
+        if not self._is_addressed_here():
+            self._answer(HTTPStatus.MISDIRECTED_REQUEST, b"This is not the address of this dashboard.\n")
         elif path == "/api/stream":
             self._stream()
         elif path == "/api/latest":
-            self._latest()
-        elif file := self.server.files.get(path):
-            if self.headers.get("If-None-Match") == file.tag:
-                self._answer(HTTPStatus.NOT_MODIFIED, b"", ETag=file.tag, Cache_Control="no-cache")
+            if found := feed.after(feed.start(), OLDEST_S):
+                self._answer(HTTPStatus.OK, found[1] + b"\n", "application/json")
             else:
-                headers = {"Content_Type": file.type, "ETag": file.tag, "Cache_Control": "no-cache"}
-                self._answer(HTTPStatus.OK, file.body, **headers)
+                self._answer(HTTPStatus.SERVICE_UNAVAILABLE, b"There is no current picture.\n")
+        elif path in self.server.files:
+            kind, body = self.server.files[path]
+            self._answer(HTTPStatus.OK, body, kind)
         else:
-            self._say(HTTPStatus.NOT_FOUND, "There is only /, /api/latest and /api/stream.\n")
+            self._answer(HTTPStatus.NOT_FOUND, b"There is only /, /api/latest and /api/stream.\n")
 
-    do_HEAD = do_GET  # noqa: N815 - the base class's name
-
-    def _has_body(self) -> bool:
-        """Whether something follows the header."""
-        lengths = self.headers.get_all("Content-Length", [])
-        return "Transfer-Encoding" in self.headers or any(length.strip() != "0" for length in lengths)
-
-    def _addressed_to_us(self) -> bool:
-        """Whether a local server is asked by a local name: pages of others could have any name point here."""
-        if not self.server.local:
+    def _is_addressed_here(self) -> bool:
+        """Whether a local server is addressed by a local name: other sites' names might be made to point here."""
+        if not self.server.is_local:
             return True
         host = self.headers.get("Host", "localhost")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
@@ -255,48 +176,31 @@ class Handler(BaseHTTPRequestHandler):
             return True
         return False
 
-    def _latest(self) -> None:
-        data = self.server.feed.latest()
-        if data is None:
-            self._say(HTTPStatus.SERVICE_UNAVAILABLE, "There is no current picture.\n")
-        else:
-            self._answer(HTTPStatus.OK, data + b"\n", Content_Type="application/json", Cache_Control="no-store")
-
     def _stream(self) -> None:
-        """Events until the browser goes away: `build` once, then a picture when it changes and every second."""
-        self.close_connection = True
-        self._head(HTTPStatus.OK, Content_Type="text/event-stream", Cache_Control="no-store")
-        if self.command == "HEAD":
-            return
-        with contextlib.suppress(OSError):
-            self.wfile.write(f"retry: {RETRY_MS}\nevent: build\ndata: {self.server.build}\n\n".encode())
-            number = self.server.feed.before()
-            while found := self.server.feed.after(number):
-                number, data = found
-                self.wfile.write(b"data: " + data + b"\n\n")
+        """Send `build` once, then a picture when it changes and every second, until the browser goes away."""
+        self._head(HTTPStatus.OK, "text/event-stream")
+        self.wfile.write(f"retry: {RETRY_MS}\nevent: build\ndata: {self.server.build}\n\n".encode())
+        number = self.server.feed.start()
+        while found := self.server.feed.after(number):
+            number, data = found
+            self.wfile.write(b"data: " + data + b"\n\n")
 
-    def _say(self, status: HTTPStatus, text: str) -> None:
-        self._answer(status, text.encode(), Content_Type="text/plain; charset=utf-8", Cache_Control="no-store")
+    def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
+        self._head(status, kind)
+        self.wfile.write(body)
 
-    def _answer(self, status: HTTPStatus, body: bytes, **headers: str) -> None:
-        self._head(status, Content_Length=str(len(body)), **headers)
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    def _head(self, status: HTTPStatus, **headers: str) -> None:
+    def _head(self, status: HTTPStatus, kind: str) -> None:
         self.send_response(status)
-        if self.close_connection:
-            headers["Connection"] = "close"
-        for name, value in {**HEADERS, **headers}.items():
-            self.send_header(name.replace("_", "-"), value)
+        for name, value in {**HEADERS, "Content-Type": kind, "Cache-Control": "no-store"}.items():
+            self.send_header(name, value)
         self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: the journal is for what goes wrong."""
+        """Log nothing."""
 
 
 def host_and_port(listen: str) -> tuple[str, int]:
-    """Of ``127.0.0.1:8000`` or ``[::1]:8000``; InputError for what is none."""
+    """Split ``127.0.0.1:8000`` or ``[::1]:8000``. InputError for anything else."""
     host, _, port = listen.rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not host or not (port.isascii() and port.isdigit() and int(port) < 1 << 16) or (":" in bare and bare == host):
@@ -304,34 +208,33 @@ def host_and_port(listen: str) -> tuple[str, int]:
     return bare, int(port)
 
 
-def opened(listen: str, feed: Feed) -> Server:
-    """The server at `listen`, as ``127.0.0.1:8000`` or ``[::1]:8000``; InputError if that cannot be had."""
+@contextmanager
+def served(feed: Feed, listen: str) -> Iterator[str]:
+    """Serve `feed` at `listen` on a thread; yield the address for a browser. InputError if it cannot listen there."""
     host, port = host_and_port(listen)
     try:
-        return Server(host, port, feed)
-    except socket.gaierror as error:
-        raise InputError(f"--listen {listen}: no such address: {error.strerror}") from error
+        server = Server(host, port, feed)
     except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            raise InputError(f"--listen {listen}: {error.strerror}") from error
-        by = _who_has(host, port)
-        other = f"{listen.rpartition(':')[0]}:{port + 1 if port < 65535 else 0}"
-        raise InputError(f"--listen {listen}: the port is taken{by}; give another one, such as {other}") from error
+        taken = "the port is taken; give another one" if error.errno == errno.EADDRINUSE else error.strerror
+        raise InputError(f"--listen {listen}: {taken}") from error
+    threading.Thread(target=server.serve_forever, name="web", daemon=True).start()
+    try:
+        yield server.url
+    finally:
+        feed.close()
+        server.shutdown()
+        server.server_close()
 
 
-def _who_has(host: str, port: int) -> str:
-    """Who has the port, if it is one of us."""
-    connection = http.client.HTTPConnection(host, port, timeout=2.0)
-    with contextlib.suppress(OSError, ValueError, http.client.HTTPException, KeyError, TypeError):
-        connection.request("GET", "/api/latest")
-        return f" by a dashboard of {json.loads(connection.getresponse().read(1 << 16))['channel']}"
-    connection.close()
-    return ""
-
-
-def address_of(server: Server) -> str:
-    """Where a browser finds it."""
-    host = str(server.server_address[0])
-    if ipaddress.ip_address(host.partition("%")[0]).is_unspecified:
-        host = socket.gethostname()
-    return f"http://{f'[{host}]' if ':' in host else host}:{server.server_port}/"
+def serve(view: View, channel: CanChannel, listen: str, duration: float | None) -> int:
+    """Serve the pictures of the open `channel` for `duration` [s], or until a signal. InputError for `listen`."""
+    feed = Feed()
+    with served(feed, listen) as address, until_signalled(duration) as stopped:
+        text = f"{address} shows {channel.name} ({channel.interface})"
+        if sys.stdout is not None:
+            print(f"dashboard: {text}", flush=True)
+        notify.ready(text)
+        for new in pictures(view, channel, stopped):
+            feed.publish(new.encoded())
+        notify.stopping()
+    return OK

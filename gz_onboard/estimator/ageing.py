@@ -34,6 +34,7 @@ from gz_onboard.estimator.ageing_fit import COMPARED, RESISTANCE, RESISTANCE_MEM
 from gz_onboard.estimator.ageing_kinds import RESISTANCE_AGED_SD, Belief, Kinds
 from gz_onboard.estimator.ekf import Covariance, SocFilter
 from gz_onboard.estimator.interval import DECILE
+from gz_onboard.estimator.saved_fields import FINITE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
@@ -360,6 +361,13 @@ class Ageing:
             self._proven = deque([self._fit], KEPT + 1)
         self.belief = self._believe()
         self._battery.age(1 / self.belief.inverse, self._resistance_factor)
+
+
+FIELDS = {
+    "capacity": dict.fromkeys(("of", "inverse", "variance", "with_soc"), FINITE),
+    "resistance": dict.fromkeys(("of", "factor", "weight", "time"), FINITE),
+}
+"""Of the saved state; `Ageing.read` knows their bounds."""
 
 
 def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbers:

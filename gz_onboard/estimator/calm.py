@@ -22,7 +22,7 @@ shrank with it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import exp, isnan, nan
+from math import exp
 from typing import Any
 
 CALM = 6000.0  # m
@@ -109,11 +109,10 @@ class Calm:
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart: the gap [m], and the last forecast's range [m] and energy [J]."""
         if self._on_route:  # which is not kept
-            return {"gap": 0.0}
-        return {"gap": self.gap} | ({} if self._before is None else {"forecast": list(self._before)})
+            return {"gap": 0.0, "forecast": None}
+        return {"gap": self.gap, "forecast": self._before and list(self._before)}
 
 
 def restored_calm(saved: Mapping[str, Any]) -> Calm:
-    """What `Calm.snapshot` gave; TypeError or ValueError if it is not that."""
-    range_, energy = map(float, saved.get("forecast", (nan, nan)))
-    return Calm(float(saved.get("gap", 0.0)), None if isnan(range_) else (range_, energy))
+    """Read what `Calm.snapshot` gave."""
+    return Calm(saved["gap"], tuple(saved["forecast"]) if saved["forecast"] else None)

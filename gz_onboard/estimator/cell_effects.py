@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.effect import QUANTITIES, Port
 from gz_onboard.physics.model import Model, share_that_ages
 
 LARGEST = 1.0  # V of a cell, of a saved state
@@ -23,7 +23,7 @@ class CellEffects:
 
     def __init__(self, model: Model, battery: Battery) -> None:
         self._battery = battery
-        self._effects = [(x.effect.name, x, share_that_ages(x)) for _, x in model.cell_voltage]
+        self._effects = [(x.effect.name, x, share_that_ages(x)) for x in model.at(Port.CELL_VOLTAGE)]
         self._quantities = dict.fromkeys(QUANTITIES, 0.0)
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {name: 0.0 for name, _, _ in self._effects}  # V of a cell
@@ -67,11 +67,10 @@ class CellEffects:
         return after
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
-        """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""
-        states = {name: float(saved[name]) for name in self.states}
-        if not all(abs(x) < LARGEST for x in states.values()):
-            raise ValueError("holds implausible voltages of effects in the cells")
-        return states
+        """Saved states, which were checked. ValueError if they are not of these effects."""
+        if saved.keys() != self.states.keys():
+            raise ValueError("is damaged: state.cell_effects has not the effects of this vehicle")
+        return dict(saved)
 
     def restore(self, states: dict[str, float], age: float | None, soc: float) -> None:
         """At rest meanwhile; for how long [s] if that is not known: for long."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gz_onboard.estimator import snapshot
 from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
@@ -26,8 +25,10 @@ from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
 from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
+from gz_onboard.estimator.snapshot import VERSION, check_snapshot
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
+from gz_onboard.estimator.start import read_saved
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import COARSE, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
@@ -45,6 +46,7 @@ LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_
 AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
 LEAP = 30.0  # s: the odometer shows whether a longer step of time was a gap, or the clock was set
 ODOMETER_WITHIN = 3.0  # s to wait for the odometer after such a step
+CELLS_KEEP = 3600.0  # s: saved cell temperatures that are older say nothing
 NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
@@ -328,29 +330,42 @@ class Estimator:
         if self.filter is None:
             return None
         return self.soc.snapshot(self.filter) | {
-            "version": snapshot.VERSION,
+            "version": VERSION,
             "key": key,
             "consumption": self._outlook.consumption,
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
-            "riding": self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()},
-            "learned": snapshot.of_learned(self.soc.ageing, self.weakest),
+            "riding": self.riding_snapshot(),
+            "learned": self.learned_snapshot(),
         }
+
+    def learned_snapshot(self) -> dict[str, Any]:
+        """What was learned of the pack's age, as part of the saved state."""
+        return {**self.soc.ageing.snapshot(), "weakest": self.weakest.snapshot()}
+
+    def riding_snapshot(self) -> dict[str, Any]:
+        """What was learned of the riding, as part of the saved state."""
+        return self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()}
 
     def wait(self, seconds: float) -> None:
         """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
         self.soc.wait(seconds)
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
-        """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        learned = self.soc.ageing, self.weakest
-        restored = snapshot.read(saved, key, age, self.soc.effects, learned, self.forecaster.restore)
-        self.ahead.restore(saved["riding"].get("on_routes"))
-        self.road.bias_x, self.road.bias_z = restored.gyro_bias
-        if restored.cell_temperature is not None:
-            self._temperatures.cells = restored.cell_temperature
-        self.soc.restore(restored.battery, restored.age, restored.cell_effects)
-        self.forecaster.pause(NEW_DAY if restored.age is None else restored.age)
+        """Continue from a snapshot that is `age` [s] old (None: not known).
+
+        ValueError if it does not fit this vehicle; then parts may have been restored: discard this estimator.
+        """
+        check_snapshot(saved, key)
+        self.forecaster.restore(saved["riding"])
+        self.ahead.restore(saved["riding"]["on_routes"])
+        self.soc.ageing.restore(saved["learned"])
+        self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))
+        self.road.bias_x, self.road.bias_z = saved["gyro_bias"]
+        if saved["cell_temperature"] is not None and age is not None and age < CELLS_KEEP:
+            self._temperatures.cells = saved["cell_temperature"]
+        self.soc.restore(read_saved(saved), age, self.soc.effects.read(saved["cell_effects"]))
+        self.forecaster.pause(NEW_DAY if age is None else age)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

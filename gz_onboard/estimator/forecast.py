@@ -18,7 +18,7 @@ on the way that it lasts, with an interval (`interval`). What is shown of it mov
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from math import hypot, inf, sqrt
 from typing import Any
 
@@ -26,15 +26,26 @@ from gz_onboard.constants import GRAVITY, HOUR
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.auxiliaries import Auxiliaries
-from gz_onboard.estimator.bounds import within
 from gz_onboard.estimator.calm import Calm, restored_calm
 from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
-from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
-from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states, unlearned
-from gz_onboard.estimator.riders import Riders, restored_riders
+from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
+from gz_onboard.estimator.ridden import (
+    KEPT,
+    MOST_SEGMENTS,
+    Past,
+    Riding,
+    Second,
+    Segment,
+    learned,
+    restored,
+    restored_states,
+    unlearned,
+)
+from gz_onboard.estimator.riders import LONGEST_NAME, MOST_RIDERS, Riders, restored_riders
+from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
 from gz_onboard.estimator.terrain import Terrain, restored_terrain
-from gz_onboard.estimator.usual import SEGMENT, Unit, Usual, restored_unit
+from gz_onboard.estimator.usual import SEGMENT, Habit, Unit, Usual, restored_unit
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.cooling import pack_constants
 from gz_onboard.physics.drawable import Drawable, drawable
@@ -56,6 +67,25 @@ HEIGHTS_ERR = 3.0  # m: so much a climb may be wrong where it is to explain how 
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 1.0  # of the logarithm of the range: beyond, it is not known at all
 COLDER_AGAIN = 0.005, 0.5, 0.5, 20.0  # SOC, degC, degC, W: changed by more, what colder cells lack is asked anew
+
+_USUAL = {quantity.name: dict.fromkeys((part.name for part in fields(Habit)), FINITE) for quantity in fields(Usual)}
+FIELDS = {
+    "segments": Each(Each(FINITE, len(KEPT)), MOST_SEGMENTS),
+    "usual": _USUAL,
+    "still": Number(0.0, 1e10),  # s
+    "time_moving": Number(0.0, 1e7),  # s
+    "rider": Text(LONGEST_NAME),
+    "riders": Each(_USUAL, MOST_RIDERS),
+    "gap": Number(-1e6, 1e6),  # m
+    "forecast": Each(Number(0.0, 1e12), 2, optional=True),  # m, J
+    "of": dict.fromkeys((unit.name for unit in fields(Unit)), FINITE),
+    "pattern": Each(Each(FINITE, 10), MOST_BINS),
+    "states": Each(FINITE, 100),
+    "terrain": dict.fromkeys((part.name for part in fields(Terrain)), FINITE),
+    "auxiliaries": {"mean": Number(-1e5, 1e5), "filed": FINITE},  # W
+    "on_routes": Each(Number(0.0, 1e12, optional=True), 2),
+}
+"""Of the saved state: what was learned of the riding."""
 
 
 @dataclass(frozen=True)
@@ -397,7 +427,6 @@ class Forecaster:
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
-        within("riding", saved)
         unit = restored_unit(saved, self._unit)
         riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from gz_onboard.estimator.load_model import Conditions, EffectInputs, LoadModel
 from gz_onboard.physics.battery import HALF_FULL
 from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.elementary import sqrt
+from gz_onboard.physics.functions import sqrt
 from gz_onboard.routes.profile import speed_profile
 from gz_onboard.routes.route import Route
 

@@ -6,11 +6,14 @@ lacks the charge that flowed uncounted.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, hypot, sqrt
+from typing import Any
 
 from gz_onboard.constants import HOUR
 from gz_onboard.estimator.ekf import Covariance, SocFilter
+from gz_onboard.estimator.saved_fields import Each, Number
 from gz_onboard.physics.battery import HALF_FULL, Battery
 
 SOC_UNKNOWN_SD = 0.5  # whatever has flowed
@@ -44,6 +47,26 @@ class Saved:
     odometer: float | None = None  # m
     own_soc: float | None = None  # the vehicle's own state of charge, 0..1
     consumption: float | None = None  # J/m that was expected
+
+
+FIELDS = {
+    "soc": Number(0.0, 1.0),
+    "v1": Number(-1.0, 1.0),  # V of a cell
+    "covariance": Each(Number(-1.0, 1.0), 3),
+    "current": Number(-1e4, 1e4, optional=True),  # A
+    "odometer": Number(-1e3, 1e10, optional=True),  # m
+    "own_soc": Number(-0.1, 1.1, optional=True),
+    "consumption": Number(-1e5, 1e5, optional=True),  # J/m
+}
+"""Of the saved state: those of `Saved`."""
+
+
+def read_saved(fields: Mapping[str, Any]) -> Saved:
+    """The saved `fields` of `FIELDS`, which were checked. ValueError for a covariance that no filter has."""
+    p00, p01, p11 = fields["covariance"]
+    if not (0 < p00 <= SOC_UNKNOWN_SD**2 and p11 > 0 and p01 * p01 <= p00 * p11):
+        raise ValueError("is damaged: state.covariance is impossible")
+    return Saved(**{name: fields[name] for name in FIELDS} | {"covariance": (p00, p01, p11)})
 
 
 def bounded(soc: float) -> float:

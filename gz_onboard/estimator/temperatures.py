@@ -7,8 +7,8 @@ from collections.abc import Callable
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.physics.cooling import pack_constants
+from gz_onboard.physics.functions import decay_over, relaxed
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.relaxation import decay_over, relaxed
 
 CELL_SD, CELL_SD_UNKNOWN = 1.0, 8.0  # K: of a sensor, of its replacement
 

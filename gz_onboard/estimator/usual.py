@@ -18,7 +18,7 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from math import exp, inf, sqrt
 from typing import Any
 
-from gz_onboard.physics.riding import DRIFT, PriorRiding
+from gz_onboard.physics.riding import PriorRiding
 
 SEGMENT = 250.0  # m: of a scooter in town neighbours of this length are hardly alike
 FADES = 200_000.0  # m: over which a ride loses its likeness to its begin; full discharges of 50 to 70 km did not
@@ -32,7 +32,7 @@ RUN_LENGTH = 4000.0  # m, over which residuals are averaged to see whether the r
 RUN_MOST = 0.7  # sd of one segment: 3.9 sd of that mean; none of 24 rides of healthy scooters of the plant had it
 MOST, MOST_VARIANCE = 10.0, 4.0  # everything is about 1; a heated van in a jam takes 5 times what the model says
 LEVEL_SD = 0.15  # of what riders and roads of one kind of vehicle cost
-PRIOR_SCATTER = 0.2 / DRIFT  # sd of a segment's price, over that of rides
+PRIOR_SCATTER = 0.2 / PriorRiding.drift  # sd of a segment's price, over that of rides
 MOST_LIKENESS = 0.8  # correlation
 FACTOR_BETWEEN = 0.03  # sd of the factor between rides: wind, tyres, luggage
 FACTOR_SCATTER = 0.18  # sd of a segment's measured less modelled energy, of the eight commissioning rides

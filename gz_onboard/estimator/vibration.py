@@ -6,15 +6,15 @@ from math import exp, inf, sqrt
 
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW
-from gz_onboard.physics.vibration import FAST, SLOW
+from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S
 
-SETTLED = 3 * SLOW  # s of samples before there is a value: 97 % of it is there
+SETTLED = 3 * VIBRATION_MEMORY_S  # s of samples before there is a value: 97 % of it is there
 STILL = 1e-6  # (m/s²)²: less is a stuck sensor's, and rounding
 FEWEST = WINDOW / 0.034  # samples in a window: a slower sensor does not show what a road does to a wheel
 
 
 class VibrationMonitor:
-    """The RMS [m/s²] of the vertical acceleration that is faster than `FAST`, over about `SLOW`.
+    """The vibration, as `physics.sensors.Vibration` defines it [m/s²], from windows of samples.
 
     Too few samples, or a sensor that shows one and the same value, begin it anew: no accelerometer is that still.
     """
@@ -32,8 +32,10 @@ class VibrationMonitor:
         dt = now - self._time
         if square < STILL or dt > 2 * WINDOW:
             self._since, self._square = now, max(square, 0.0)
-        keep = exp(-WINDOW / n / FAST)  # of white shaking, `Vibration` shows this share
-        self._square += (1 - exp(-min(dt, WINDOW) / SLOW)) * (square * keep * keep * 2 / (1 + keep) - self._square)
+        keep = exp(-WINDOW / n / VIBRATION_PERIOD_S)  # of white shaking, `Vibration` shows this share
+        self._square += (1 - exp(-min(dt, WINDOW) / VIBRATION_MEMORY_S)) * (
+            square * keep * keep * 2 / (1 + keep) - self._square
+        )
         self._time = now
 
     def value(self, now: float) -> float | None:

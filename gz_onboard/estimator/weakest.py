@@ -30,6 +30,7 @@ from typing import Any
 
 from gz_onboard.estimator.ageing import SAME, Learned
 from gz_onboard.estimator.joint import Joint
+from gz_onboard.estimator.saved_fields import FINITE, Each
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading
@@ -326,6 +327,12 @@ class Weakest:
         # Once something was learned where a lie shows, one that begins elsewhere contradicts it and is left out.
         self._kept = self.known.copy() if kept.blocks >= PROVEN else kept
         self._battery.weaken(self.believed())
+
+
+_COUNTS = dict.fromkeys(("load", "response", "blocks"), FINITE)
+_DIFFERENCES = {"means": Each(FINITE, 3), "rows": Each(FINITE, 6), **_COUNTS}
+FIELDS = {"of": FINITE, "known": _DIFFERENCES, "kept": _DIFFERENCES}
+"""Of the saved state; `Weakest.read` knows their bounds."""
 
 
 def _numbers(of: Differences) -> dict[str, Any]:

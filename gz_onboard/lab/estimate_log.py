@@ -75,7 +75,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
         try:
             how = How(task.filter_name, task.frames, task.signals, route, state=task.state)
             ridden = ride_through(ride, how, log, progress)
-            learned = text_of(ridden.pipeline, ridden.went_on) if ridden.went_on else None
+            learned = text_of(ridden.pipeline) if ridden.went_on else None
             summary = summary_of(ridden, task.log, task.picture)
             log.note(_RECORD, {**made_of, **_link(ridden, learned), _SUMMARY: summary_to_keep(summary)})
             log.close()
@@ -134,7 +134,7 @@ def kept_in_turn(tasks: Sequence[EstimateTask]) -> list[EstimateTask]:
 
 def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
     """All that the estimates of a log depend on, as texts."""
-    effects = {Path(effect.term.__code__.co_filename) for effect in vehicle.model.effects}
+    effects = {effect.file for effect in vehicle.model.effects}
     files = {vehicle.file, vehicle.range_dbc, *vehicle.mapping.dbc_files, *(file for file in effects if file.is_file())}
     return {
         "version": f"{__version__}, summary {SUMMARY_VERSION}",

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from gz_onboard import state
 from gz_onboard.bus.codec import BACK_NS
@@ -40,13 +39,12 @@ class StateAt:
 class WentOn:
     """How a ride began: whether there was a saved state to go on from, and its age [s] if that is known.
 
-    digest: of the state's file; learned: what that had of the vehicle, by name.
+    digest: of the state's file.
     """
 
     found: bool
     age: float | None = None
     digest: str = ""
-    learned: Mapping[str, Any] = field(default_factory=dict)
 
 
 def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
@@ -64,30 +62,25 @@ def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
             if age is None:
                 age = _age_after(copy, begin, ride)
             pipeline.estimator.restore(snapshot, pipeline.vehicle.key, age)
-        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+        except ValueError as error:
             raise _refused(at.file, copy, error) from error
-        began = WentOn(True, age, digest_of(copy), snapshot.get("learned", {}))
+        began = WentOn(True, age, digest_of(copy))
     if at.rider:
         pipeline.estimator.ridden_by(at.rider)
     return began
 
 
 def _refused(file: Path, copy: Path, error: Exception) -> InputError:
-    *_, before = state.copies(file)
+    _, before = state.copies(file)
     older = f"; the one before it is {before}" if copy != before and before.exists() else ""
-    why = str(error) or repr(error)
     return InputError(
-        f"{copy}: {why}; give the state of this vehicle; to begin anew, give a new name, of no file yet{older}"
+        f"{copy}: {error}; give the state of this vehicle; to begin anew, give a new name, of no file yet{older}"
     )
 
 
 def latest(file: Path) -> Path | None:
     """Where the latest state is, of the copies of `file`; None if there is none."""
-    unfinished, *whole = state.copies(file)
-    with suppress(ValueError):  # cut off while it was written: the one before it is whole
-        if state.load(unfinished, _LATE):
-            return unfinished
-    return next((copy for copy in whole if copy.exists()), None)
+    return next((copy for copy in state.copies(file) if copy.exists()), None)
 
 
 def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
@@ -107,15 +100,11 @@ def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
     return 0.0
 
 
-def text_of(pipeline: Pipeline, went_on: WentOn) -> bytes | None:
-    """The text of the state file after a ride; None while nothing is known. InputError if it cannot be saved.
-
-    What a ride could not go on with, as its table has no column for it, stays as it was learned before.
-    """
+def text_of(pipeline: Pipeline) -> bytes | None:
+    """The text of the state file after a ride; None while nothing is known. InputError if it cannot be saved."""
     snapshot = pipeline.estimator.snapshot(pipeline.vehicle.key)
     if snapshot is None:
         return None
-    snapshot["learned"] = {**went_on.learned, **snapshot["learned"]}
     try:
         return state.encode(snapshot, pipeline.codec.last_ns * 1e-9)
     except (ValueError, TypeError) as error:
@@ -130,7 +119,7 @@ def held(file: Path) -> Iterator[None]:
     """
     if file.suffix != SUFFIX:
         raise InputError(f"state {file}: give it a name that ends in {SUFFIX}")
-    folder = state.target(file).parent
+    folder = state.copies(file)[0].parent
     with writing(file):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -27,7 +27,7 @@ from gz_onboard.lab.export_contents import contents_text, log_contents
 from gz_onboard.lab.export_tables import (
     ESTIMATES,
     DecoderError,
-    Source,
+    ExportSource,
     decoder_of,
     holds_frames,
     signals_of,
@@ -119,7 +119,7 @@ def _each(found: Sequence[Path], work: Callable[[Path], None]) -> int:
 def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) -> None:
     """Write what is asked for of one log, and say it."""
     not_an_input([out] if suffix else [], [log, *(arguments.dbc or [])])
-    source = Source(log, arguments.start, arguments.end, arguments.columns)
+    source = ExportSource(log, arguments.start, arguments.end, arguments.columns)
     with whole(out, suffix) as part:
         told = _write(arguments, source, part, suffix)
     for damage in dict.fromkeys(map(str, source.damages)):
@@ -127,7 +127,7 @@ def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) ->
     print(f"wrote {out}: {told}")
 
 
-def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: str) -> str:
+def _write(arguments: argparse.Namespace, source: ExportSource, part: Path, suffix: str) -> str:
     """Write what is asked for to `part`, in the format of `suffix`, none for a folder; gives what it was."""
     kind = suffix or f"/.{arguments.table_format or 'parquet'}"
     has_frames, topics = holds_frames(source.log), logs.json_channels(source.log)
@@ -147,7 +147,7 @@ def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: st
     return "; ".join(texts)
 
 
-def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: str, names: Sequence[str]) -> str:
+def _estimates(arguments: argparse.Namespace, source: ExportSource, part: Path, kind: str, names: Sequence[str]) -> str:
     """Of a folder the tables `names` of `ESTIMATES`, else the estimates."""
     if not kind.startswith("/"):
         if kind not in _TABLES:
@@ -159,7 +159,7 @@ def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: 
     return f"{write_estimates(source, files)} estimates"
 
 
-def _frames(source: Source, part: Path, suffix: str) -> str:
+def _frames(source: ExportSource, part: Path, suffix: str) -> str:
     if source.columns is not None:
         raise InputError("--columns: applies to estimates or signals, with --estimates or --signals")
     _, frames = source.frames()
@@ -172,7 +172,7 @@ def _frames(source: Source, part: Path, suffix: str) -> str:
     return f"{len(frames)} frames"
 
 
-def _signals(arguments: argparse.Namespace, source: Source, part: Path, kind: str) -> str:
+def _signals(arguments: argparse.Namespace, source: ExportSource, part: Path, kind: str) -> str:
     vehicle = read_vehicle(arguments.vehicle) if arguments.vehicle else None
     if kind == ".mcap" and holds_frames(source.log):
         section, frames = source.frames()

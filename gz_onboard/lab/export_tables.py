@@ -28,7 +28,7 @@ _MESSAGE = "/can/"  # begins the topic of a message's signals
 
 
 @dataclass
-class Source:
+class ExportSource:
     """A log, and what part of it is wanted: of time, [s] since its beginning, and of the columns (None: all)."""
 
     log: Path
@@ -63,7 +63,7 @@ class Source:
 # --- columns ------------------------------------------------------------------------------------------------------
 
 
-def chosen(source: Source, known: Iterable[str]) -> set[str]:
+def chosen(source: ExportSource, known: Iterable[str]) -> set[str]:
     """The columns that are wanted of those `known`, by names with or without unit. InputError for one not there."""
     names = list(dict.fromkeys(known))
     if source.columns is None:
@@ -91,7 +91,7 @@ def topic_columns(log: Path, topic: str) -> dict[str, str]:
 # --- estimates ----------------------------------------------------------------------------------------------------
 
 
-def estimate_rows(source: Source) -> list[tuple[int, dict[str, Any]]]:
+def estimate_rows(source: ExportSource) -> list[tuple[int, dict[str, Any]]]:
     """(time [ns], values) of the estimates. InputError if there are none, which says what else the log holds."""
     if rows := source.rows(ESTIMATE_TOPIC):
         return rows
@@ -100,7 +100,7 @@ def estimate_rows(source: Source) -> list[tuple[int, dict[str, Any]]]:
     raise InputError(f"{source.log}: holds no estimates ({ESTIMATE_TOPIC}){_other(source.log)}")
 
 
-def write_estimates(source: Source, files: Mapping[str, Path]) -> int:
+def write_estimates(source: ExportSource, files: Mapping[str, Path]) -> int:
     """Write a table, a row each, of the estimates and of each other topic in `files` that has rows and wanted columns.
 
     Gives how many estimates. InputError if there are none, or if no table has a column that is wanted.
@@ -135,7 +135,7 @@ def recorded_messages(log: Path) -> list[str]:
     return [topic.removeprefix(_MESSAGE) for topic in logs.json_channels(log) if topic.startswith(_MESSAGE)]
 
 
-def recorded_signals(source: Source) -> tuple[dict[str, dict[str, str]], Iterator[Decoded]]:
+def recorded_signals(source: ExportSource) -> tuple[dict[str, dict[str, str]], Iterator[Decoded]]:
     """(column -> unit of each message, the signals), as they stand in a log that has no frames."""
     named = {name: _signal_columns(source.log, name) for name in recorded_messages(source.log)}
     first = min((rows[0][0] for name in named if (rows := source.rows(_MESSAGE + name))), default=0)
@@ -168,7 +168,7 @@ class LogSignals:
     decoder: Decoder | None
 
 
-def signals_of(source: Source, files: list[Path] | None, vehicle: Vehicle | None) -> LogSignals:
+def signals_of(source: ExportSource, files: list[Path] | None, vehicle: Vehicle | None) -> LogSignals:
     """The signals of `source`, decoded as of `decoder_of` where it has frames. InputError if there are none."""
     decoded: Iterable[Decoded]
     columns: Mapping[str, Mapping[str, str]]
@@ -185,7 +185,7 @@ def signals_of(source: Source, files: list[Path] | None, vehicle: Vehicle | None
     return LogSignals(kept, decoded, decoder)
 
 
-def write_signals(source: Source, out: Path, suffix: str, signals: LogSignals) -> int:
+def write_signals(source: ExportSource, out: Path, suffix: str, signals: LogSignals) -> int:
     """Write signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
 
     suffix: of `out`; of a folder, that of its tables with a slash before.

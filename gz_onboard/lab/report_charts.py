@@ -13,7 +13,7 @@ Values = Sequence[float]
 
 
 @dataclass(frozen=True)
-class Curve:
+class ChartLine:
     """A line in a chart with its own abscissae. colour: a class of the page; band: its lower and upper end."""
 
     name: str
@@ -33,7 +33,7 @@ class Abscissa:
     unit: str
 
 
-def chart(title: str, unit: str, curves: Sequence[Curve], below: Abscissa, *, zero: bool = True) -> str:
+def chart(title: str, unit: str, curves: Sequence[ChartLine], below: Abscissa, *, zero: bool = True) -> str:
     """A figure with `curves` over `below`; zero: whether 0 is on the ordinate. Nothing without a known value."""
     curves = [curve for curve in curves if any(map(isfinite, curve.y))]
     if not curves:
@@ -76,7 +76,7 @@ def key(text: str, colour: str) -> str:
     return f'<span class="key"><i class="{colour}"></i>{html.escape(text)}</span>'
 
 
-def _key(curve: Curve) -> str:
+def _key(curve: ChartLine) -> str:
     colour = "muted" if curve.dashed else curve.colour
     return key(curve.name, colour)
 

@@ -12,7 +12,7 @@ from gz_onboard.events import TOLD, Activity, State, cause_words, words
 from gz_onboard.lab.estimate import lacks_energy, summary_rows
 from gz_onboard.lab.logged import Logged
 from gz_onboard.lab.plot import column, spans, with_holes
-from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
+from gz_onboard.lab.report_charts import Abscissa, ChartLine, bar, chart, key, strip
 from gz_onboard.lab.report_ride import ReportedRide
 from gz_onboard.lab.report_svg import axis_of, draw_map
 from gz_onboard.lab.why import Why
@@ -122,14 +122,14 @@ def _charts(ride: ReportedRide, rows: Sequence[Logged]) -> list[str]:
     soc, sd = column(rows, "soc", 100), column(rows, "soc_sd", 100)
     band = [m - s for m, s in zip(soc, sd, strict=True)], [m + s for m, s in zip(soc, sd, strict=True)]
     others = [
-        Curve(words(role).split()[0], [(t - start) / seconds for t in times], values, _TEMPERATURE_COLOURS[role])
+        ChartLine(words(role).split()[0], [(t - start) / seconds for t in times], values, _TEMPERATURE_COLOURS[role])
         for role, (times, values) in ride.temperatures.items()
     ]
-    cells = Curve("cells", time, column(rows, "cell_temperature"), "orange")
+    cells = ChartLine("cells", time, column(rows, "cell_temperature"), "orange")
     return [
-        chart("Speed", "km/h", [Curve("", time, column(rows, "speed", 3.6), "blue")], below),
-        chart("Power of the pack", "kW", [Curve("", time, power, "orange")], below),
-        chart("State of charge", "%", [Curve("with ± σ", time, soc, "green", band)], below, zero=False),
+        chart("Speed", "km/h", [ChartLine("", time, column(rows, "speed", 3.6), "blue")], below),
+        chart("Power of the pack", "kW", [ChartLine("", time, power, "orange")], below),
+        chart("State of charge", "%", [ChartLine("with ± σ", time, soc, "green", band)], below, zero=False),
         _range(rows),
         chart("Temperatures", "°C", [cells, *others], below, zero=False),
     ]
@@ -142,12 +142,12 @@ def _range(rows: Sequence[Logged]) -> str:
     known = [i for i, value in enumerate(left) if isfinite(value)]
     if not known:
         return ""
-    curves = [Curve("forecast, P10 to P90", ridden, left, "blue", (p10, p90))]
+    curves = [ChartLine("forecast, P10 to P90", ridden, left, "blue", (p10, p90))]
     first, last = known[0], known[-1]
     text = _said("At first it said", left, p10, p90, first)
     if ridden[last] - ridden[first] > 0 and not any(row.get("activity") == Activity.CHARGING.name for row in rows):
         came = [left[last] + ridden[last] - x if i <= last else nan for i, x in enumerate(ridden)]
-        curves.append(Curve("what it came to", ridden, came, "muted", dashed=True))
+        curves.append(ChartLine("what it came to", ridden, came, "muted", dashed=True))
         text += f"; then {ridden[last] - ridden[first]:.2f} km were ridden"
     text += _said(", and at the end it said", left, p10, p90, last)
     figure = chart("Range over the distance", "km", curves, Abscissa(axis_of(ridden, whole=False), "km"))

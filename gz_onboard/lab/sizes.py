@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import log
 
-from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.physics.parameters import USUAL_CELLS, declared_parameters
 from gz_onboard.physics.riding import PriorRiding
-from gz_onboard.physics.similarity import USUAL_CELLS
 from gz_onboard.vehicle import Vehicle
 
 

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
-from gz_onboard.physics.model import air_density, all_quantities, drag_torque, over, total
-from gz_onboard.physics.relaxation import relaxed
+from gz_onboard.physics.functions import relaxed
+from gz_onboard.physics.model import air_density, all_quantities, drag_torque, over, stepper, total
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
@@ -99,7 +98,7 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         time_moving(measured),
     )
     v1, result = 0.0, np.empty(len(columns[0]))
-    effects = CellEffects(vehicle.model, battery)
+    effects, q = stepper(vehicle.model.at(Port.CELL_VOLTAGE), 0.5), all_quantities()
     rows = zip(*(column.tolist() for column in columns), strict=True)
     for i, (amperes, celsius, shaken, moving) in enumerate(rows):
         cell = amperes / m
@@ -107,15 +106,14 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
         half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
         soc -= half
-        others = {"vibration": shaken, "time_moving": moving}
-        if effects:
-            effects.step(0.5, cell, soc, celsius, others)
-        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + effects.overpotential)
+        q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken, "time_moving": moving}
+        q["cell_capacity"] = battery.cell_capacity(celsius)
+        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + sum(effects(q)))
         result[i] = battery.pack_voltage(volts, amperes)
         v1 = relaxed(v1, r1 * cell, decay)
         soc -= half
-        if effects:
-            effects.step(0.5, cell, soc, celsius, others)
+        q["soc"] = soc
+        effects(q)
     return result
 
 
@@ -180,16 +178,17 @@ def _temperatures(
 
     if "motor_temperature" in measured:
         heats = measured["motor_heat"], measured["idle_heat"]
-        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), *heats)
+        warm = start("motor_temperature")
+        add("motor_temperature", MotorCooling(p, warm, warm), *heats)
     if "inverter_temperature" in measured:
-        network = InverterCooling.of(p, start("inverter_temperature"))
-        add("inverter_temperature", network, measured["inverter_heat"])
+        warm = start("inverter_temperature")
+        add("inverter_temperature", InverterCooling(p, warm, warm), measured["inverter_heat"])
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
         rest = battery.ocv_over(levels, cells) * battery.cells_series
         delivered = measured.get("pack_power", measured["pack_voltage"] * current)
         generated = heat(rest, 0.0, current) - delivered + battery.reversible_heat(current, levels, cells)
-        pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
+        pack = LumpedCooling(p, "pack", start("cell_temperature"))
         add("cell_temperature", pack, generated)
     return found

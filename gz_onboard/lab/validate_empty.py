@@ -8,7 +8,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_score import NAMES, PackEmpty
-from gz_onboard.physics.derating import DeratingCurve
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.run import Run, ran_empty
 from gz_onboard.vehicle import Vehicle
 
@@ -29,12 +29,12 @@ def pack_empty(vehicle: Vehicle, run: Run, load: Load | None) -> PackEmpty | Non
     return PackEmpty(time, distance * 1e-3, soc, float(run.series["time"][held]))
 
 
-def _held_back(share: DeratingCurve, soc: Array) -> int:
+def _held_back(share: PiecewiseLinear, soc: Array) -> int:
     """From which index of `soc` on the controller takes current off for want of charge; at most the last.
 
     Of a ride that begins so, the last: its vehicle was held back as well.
     """
-    free = np.flatnonzero(np.interp(soc, share.at, share.share) >= 1.0)
+    free = np.flatnonzero(share.over(soc) >= 1.0)
     return min(int(free[-1]) + 1, len(soc) - 1) if len(free) else len(soc) - 1
 
 

@@ -2,13 +2,13 @@
 
     dSOC/dt = -I/(3600·Ah)      dV1/dt = -V1/(R1·C1) + I/C1      V = V_oc(SOC, T) - R0·I - V1
 
-with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature; V_oc goes on
-beyond full and empty along its last slope, so that an estimate that strays there is still shown its way back. A cold
-cell rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is what it loses (eq. 2.24) and, with
-`entropy` over SOC, what the reaction gives or takes as heat without loss.
+with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature. V_oc continues
+beyond full and empty along its last slope, so that an estimate that strays there still finds its way back. A cold cell
+rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is its loss (eq. 2.24) and, with `entropy`
+over SOC, the reversible heat of the reaction.
 
-The functions are the equations, of floats and of numpy arrays alike; who simulates, estimates, calibrates, validates
-or discovers calls them. The RC pair is `physics.relaxation`.
+Simulation, estimator, calibration, validation and discovery all call these equations, for floats and numpy arrays
+alike. The RC pair is the lag of `physics.functions`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,15 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
-from gz_onboard.physics.relaxation import decay_over, relaxed
-from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, Row, decay_over, extended, extended_over, relaxed
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
 T = TypeVar("T")
 Overpotential = Callable[[float, float, float, float], float]
-"""What a cell's voltage lacks [V] beside R0 and the RC pair, in the mean: of a cell's mean current [A], SOC,
-temperature [degC] and form factor squared, see `Battery.settled_current`."""
+"""Mean voltage [V] that a cell loses beyond R0 and the RC pair: a function of its mean current [A], SOC, temperature
+[degC] and form factor squared, see `Battery.settled_current`."""
 HALF_FULL = 0.5  # SOC that is taken where it is not known
 MOST_SOC_SD = 0.3  # a SOC of which nothing is known lies between 0 and 1: that is 0.29
 QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
@@ -52,9 +51,9 @@ def current_of(power: float, source: float, resistance: float) -> float | None:
 
 
 def heat(rest: Any, terminal: Any, current: Any) -> Any:
-    """Heat [W]: what leaves the chemistry and not the terminals (eq. 2.24; as printed it mixes cell and pack).
+    """Heat [W]: power of the chemistry less that at the terminals (eq. 2.24; as printed it mixes cell and pack).
 
-    It counts what the RC pair's capacitor stores for a minute as heat, as the printed form does.
+    Energy that the RC pair's capacitor stores for a minute counts as heat, as in the printed form.
     """
     return (rest - terminal) * current
 
@@ -62,8 +61,8 @@ def heat(rest: Any, terminal: Any, current: Any) -> Any:
 def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
     """Heat [W] of the change of order in the electrodes, -I·T·dU/dT (Bernardi 1985); cold if it is negative.
 
-    entropy: dU/dT of the open-circuit voltage [V/K]; temperature in degC. It changes its sign with the current's, and
-    is in no voltage: what a cell delivers it takes from its surroundings.
+    entropy: dU/dT of the open-circuit voltage [V/K]; temperature in degC. Its sign changes with the current's. It does
+    not show in the voltage: the cell exchanges this heat with its surroundings.
     """
     return -entropy * current * (temperature + KELVIN)
 
@@ -71,8 +70,8 @@ def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
 def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
     """Heat [W] of a cell's resistors alone; current_squared: mean square of its current [A²].
 
-    It is `heat` but for what the RC pair's capacitor takes in and gives back; over a ride both sum to the same. This
-    one takes bursts faster than its steps, by their mean square.
+    It is `heat` without the energy that the RC pair's capacitor takes in and gives back; over a ride both have the same
+    sum. The mean square includes bursts faster than the steps.
     """
     return r0 * current_squared + v1 * v1 / r1
 
@@ -95,7 +94,7 @@ class Window:
         return min(max((soc - self.low) / width, 0.0), 1.0), min(sqrt(sd * sd + self.sd**2) / width, MOST_SOC_SD)
 
     def of_cells(self, shown: float) -> float:
-        """The cells' state of charge for what the vehicle shows."""
+        """The cells' state of charge for the vehicle's."""
         return self.low + shown * (self.high - self.low)
 
 
@@ -122,9 +121,9 @@ class Health:
     weakest: WeakGroup | None = None  # None: all groups are taken to be alike
 
     def carried(self, current: float, ages: float) -> float:
-        """The current [A] that a cell as new would carry: of what has aged less is left to carry `current`.
+        """The current [A] by which an effect that ages less makes the loss of the aged cell at `current` [A].
 
-        ages: the share of what it meets that ages so.
+        ages: the share of the effect that grows with the resistance.
         """
         return (1 + (self.resistance - 1) * ages) * current
 
@@ -136,8 +135,7 @@ class Battery:
     cells_series: int
     cells_parallel: int
     capacity: float  # A·h of a cell at 25 degC
-    capacity_temperature: Row  # degC
-    capacity_share: Row  # of the capacity at 25 degC
+    capacity_share: PiecewiseLinear  # of the capacity at 25 degC, over degC
     cutoff_voltage: float  # V of a cell
     series_resistance: float  # ohm, of the pack beside its cells
     ocv_soc: Row
@@ -148,30 +146,20 @@ class Battery:
     c1: Mesh  # F
     resistance_factor: float = 1.0  # that is in r0, r1 and c1
     resistance_sd: float = 0.0  # relative, of that factor
-    rest_shift_temperature: Row = ()  # degC; none: V_oc does not depend on temperature
-    rest_shift_value: Row = ()  # V of a cell
+    rest_shift_curve: PiecewiseLinear | None = None  # V of a cell over degC; None: V_oc does not depend on temperature
     rest_shift_sd: float = 0.0  # V
     window: Window = field(default_factory=Window)
-    entropy_soc: Row = ()  # none: no reversible heat
-    entropy_value: Row = ()  # V/K of a cell
-    voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
-    voltage_error_value: Row = ()  # V of a cell, sd
-    voltage_error_time_temperature: Row = ()  # degC; none: it errs the same way for as long at all temperatures
-    voltage_error_time_value: Row = ()  # s
+    entropy: PiecewiseLinear | None = None  # V/K of a cell over SOC; None: no reversible heat
+    voltage_error_curve: PiecewiseLinear | None = None  # V of a cell, sd, over degC; None: the same at all temperatures
+    voltage_error_time_curve: PiecewiseLinear | None = None  # s, over degC; None: the same at all temperatures
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
     health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
-        fresh = self.capacity * linear(self.capacity_temperature, self.capacity_share, temperature)
+        fresh = self.capacity * self.capacity_share.at(temperature)
         return self.health.capacity * fresh
-
-    def capacity_share_over(self, temperature: Array) -> Array:
-        """The share of the capacity at 25 degC that there is at `temperature` (m,) [degC]."""
-        import numpy as np
-
-        return np.asarray(np.interp(temperature, self.capacity_temperature, self.capacity_share))
 
     def pack_capacity(self, temperature: float) -> float:
         """Capacity of the pack [A·h] at `temperature` [degC]."""
@@ -179,46 +167,35 @@ class Battery:
 
     def rest_shift(self, temperature: float) -> float:
         """How much higher [V] a cell rests at `temperature` [degC] than `ocv_value` says."""
-        if not self.rest_shift_value:
-            return 0.0
-        return linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+        return self.rest_shift_curve.at(temperature) if self.rest_shift_curve else 0.0
 
     def voltage_error(self, temperature: float, usual: float) -> float:
-        """By how much [V] the circuit errs at `temperature` [degC], one sd; `usual` [V] if that is not known."""
-        errors = self.voltage_error_value
-        return linear(self.voltage_error_temperature, errors, temperature) if errors else usual
+        """Error [V, sd] of the circuit at `temperature` [degC]; `usual` [V] if the file does not say."""
+        return self.voltage_error_curve.at(temperature) if self.voltage_error_curve else usual
 
     def voltage_error_time(self, temperature: float, usual: float) -> float:
-        """For how long [s] the circuit errs the same way at `temperature` [degC]; `usual` [s] if that is not known."""
-        times = self.voltage_error_time_value
-        return linear(self.voltage_error_time_temperature, times, temperature) if times else usual
+        """Correlation time [s] of that error at `temperature` [degC]; `usual` [s] if the file does not say."""
+        return self.voltage_error_time_curve.at(temperature) if self.voltage_error_time_curve else usual
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
         volts, slope = extended(self.ocv_soc, self.ocv_value, soc)
-        if temperature is not None and self.rest_shift_value:
+        if temperature is not None and self.rest_shift_curve:
             volts += self.rest_shift(temperature)
         return volts, slope
 
     def ocv_over(self, soc: Array, temperature: Array) -> Array:
         """`ocv` at `soc` and `temperature`, both (m,): values only."""
-        import numpy as np
-
         volts = extended_over(self.ocv_soc, self.ocv_value, soc)
-        if self.rest_shift_value:
-            volts = volts + np.interp(temperature, self.rest_shift_temperature, self.rest_shift_value)
+        if self.rest_shift_curve:
+            volts = volts + self.rest_shift_curve.over(temperature)
         return volts
 
     def reversible_heat(self, current: Any, soc: Any, temperature: Any) -> Any:
         """`reversible_heat` of the pack [W] at its `current` [A] and `temperature` [degC]; all floats, or all (n,)."""
-        if not self.entropy_soc:
+        if self.entropy is None:
             return 0.0 * current
-        if isinstance(soc, float):
-            entropy: Any = linear(self.entropy_soc, self.entropy_value, soc)
-        else:
-            import numpy as np
-
-            entropy = np.interp(soc, self.entropy_soc, self.entropy_value)
+        entropy: Any = self.entropy.at(soc) if isinstance(soc, float) else self.entropy.over(soc)
         return reversible_heat(self.cells_series * entropy, current, temperature)
 
     def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:
@@ -241,7 +218,7 @@ class Battery:
     def soc_at_load(self, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:
         """The SOC of a cell with this `voltage` [V] at a `current` [A] and `temperature` [degC]; v1 [V]: its RC pair's.
 
-        It may be below 0 or above 1, as the open-circuit voltage goes on there.
+        It may be below 0 or above 1, where the open-circuit voltage continues.
         """
         soc = HALF_FULL
         for _ in range(SOC_ROUNDS):
@@ -280,7 +257,7 @@ class Battery:
         return terminal_voltage(ocv, r0, current, v1), slope - current * r0_slope
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
-        """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""
+        """The same battery with capacity, cut-off and resistances of a vehicle's `parameters`."""
         factor = parameters["cell_resistance_factor"]
         battery = replace(
             self,
@@ -342,8 +319,8 @@ class Battery:
         """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
 
         form_factor_squared: the mean square of the current over the square of its mean: in traffic the current comes
-        in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: what a cell's
-        voltage lacks beside R0 and the RC pair.
+        in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: voltage that a cell
+        loses beyond R0 and the RC pair.
         """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc, temperature)[0]

@@ -1,30 +1,29 @@
-"""What an effect is: one physical cause, in one file of ``physics/effects``.
+"""An effect: one physical cause, in one file of ``physics/effects``.
 
 An effect file has
-- a docstring: what it is, its equation, its source;
+- a docstring: the cause, its equation, its source;
 - ``PORT``: where it acts (one of `Port`);
-- ``PARAMETERS``: a tuple of `Parameter` (name, unit, prior, its sd, low, high, source);
-- ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are the quantities that it
-  reads (names from `QUANTITIES`), its keyword arguments are its parameters, or
-  those of the vehicle (`VEHICLE_PARAMETERS`), or those of the package's other effects. Pure; floats and numpy arrays
-  alike, so it uses operators, ``abs``, and the functions of `physics.elementary` only;
-- if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, that its state keeps over
-  ``dt`` [s]. The effect's value then is not the term but the state x, 0 at the start, which goes to what the term
-  says: x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
-- what others need to know of it, if so: ``STORES_ENERGY = True`` (it gives back what it took, and the accelerometer
-  measures it), ``TURNING_LOSS = True`` (a chassis that turns has the same loss);
-- ``variation(quantity, ..., *, nuisance, ...)``, if healthy vehicles are known to differ from the equation: the factor
-  on the term, 1 at nuisances of 0, which discovery fits. It may take parameters too, and what they are on the healthy
-  vehicle as ``healthy_`` before the name;
-- ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
-  from its look-alikes; ``STRENGTHS``, the parameters that then change, the first if it is not given; ``VARIES = True``
-  if it differs from ride to ride by itself; ``CAUSE``, if every model has the effect: what a change of it is called,
-  and its equation.
+- ``PARAMETERS``: a tuple of `Parameter`;
+- ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are quantities (names from
+  `QUANTITIES`). Its keyword arguments are its parameters, those of the vehicle (`VEHICLE_PARAMETERS`) or those of the
+  package's other effects. It is pure and takes floats and numpy arrays alike: operators, ``abs``, and the elementary
+  functions of `physics.functions`;
+- if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, by which its state decays over
+  ``dt`` [s]. The value of the effect is then the state x, 0 at the start, which follows the term:
+  x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
+- optional traits: ``STORES_ENERGY = True`` (it returns the energy it took, and the accelerometer measures it);
+  ``TURNING_LOSS = True`` (a chassis that turns includes the same loss);
+- ``variation(quantity, ..., *, nuisance, ...)`` where healthy vehicles are known to differ from the equation: a factor
+  on the term, 1 at nuisances of 0, which the discovery fits. It may also take parameters, and their values on the
+  healthy vehicle with ``healthy_`` before the name;
+- for a candidate of the discovery: ``SHOWN_BY``, the data that would show it and the ride that would tell it from its
+  look-alikes; ``STRENGTHS``, the parameters that then change (the first by default); ``VARIES = True`` if it differs
+  from ride to ride by itself; ``CAUSE``, for an effect of every model: the name of a change of it, and its equation.
 
 Sign conventions
     speed, motor torque, motor current   positive forward, driving
     battery current                      positive discharging
-    forces at the wheel                  positive against the vehicle's motion (what the motor has to overcome)
+    forces at the wheel                  positive against the vehicle's motion: the motor has to overcome them
     powers and losses                    positive consuming
     grade                                positive uphill
     headwind                             positive against the vehicle
@@ -36,28 +35,35 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-import pkgutil
+import os
+import stat
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any
 
 from gz_onboard.errors import InputError, nearest, shown
 
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+Values = Any
+"""A quantity, a term or a decay: a float, or an array (n,) over the steps of a ride."""
+
 
 class Port(Enum):
-    """Where an effect acts, with the unit of its term."""
+    """The place where an effect acts, with the unit of its term."""
 
     WHEEL_FORCE = "N"  # road load at the driven wheel's contact, against the motion
     TYRE = "N (tyres)"  # the same, as a moment on the wheels: rolling loss
     MOTOR_LOSS = "W"  # heat in the motor: between shaft and inverter
     INVERTER_LOSS = "W (inverter)"  # heat in the inverter: between motor and DC link
-    DC_POWER = "W (DC link)"  # power drawn from the pack beside the inverter
-    CELL_VOLTAGE = "V"  # what a cell's terminals lack, beside OCV, R0 and the one RC pair; positive lowers them
+    DC_POWER = "W (DC link)"  # power drawn from the pack, not through the inverter
+    CELL_VOLTAGE = "V"  # lost in a cell beyond R0 and the RC pair; positive lowers the terminal voltage
 
 
 ROAD_LOAD = (Port.WHEEL_FORCE, Port.TYRE)
@@ -85,17 +91,18 @@ QUANTITIES: dict[str, str] = {
     "soc": "1, state of charge",
 }
 PACKAGE_EFFECTS = Path(__file__).resolve().parent / "effects"
-MOVING = 0.5  # m/s: what counts for time_moving
+MOVING = 0.5  # m/s: slower does not count as time_moving
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect: what it is and what it can be.
+    """A parameter of an effect or of the vehicle.
 
-    low, high: of any road vehicle, from a kick scooter to a van of 3.5 t. The prior is that of a scooter; how it grows
-    with another vehicle is in `physics.similarity`, and what nothing there tells is `required` of a file with a
-    battery. ride_sd: by how much what rides show of it scatters from ride to ride [unit], at the prior. healthy_sd:
-    within what a healthy vehicle may show of it where its model lacks the effect. bench: found on one at steady points.
+    low, high: bounds for any road vehicle, from a kick scooter to a van of 3.5 t. The prior describes a scooter;
+    grows_with: how it grows with another vehicle, as powers of that vehicle's sizes, such as "mass wheel_radius^2".
+    required: no prior fits, so a file with a battery must give it. ride_sd: scatter of the value that rides show, from
+    ride to ride, at the prior [unit]. healthy_sd: how much of it a healthy vehicle may show whose model does not
+    include the effect. bench: it is found on a bench, at steady points.
     """
 
     name: str
@@ -109,24 +116,47 @@ class Parameter:
     healthy_sd: float | None = None
     bench: bool = False
     required: bool = False
+    grows_with: str = ""
 
     def __post_init__(self) -> None:
         if not self.low <= self.prior <= self.high:
             raise ValueError(f"{self.name}: prior {self.prior} is outside {self.low} to {self.high} {self.unit}")
 
 
+# How priors grow from the scooter to another vehicle: powers of its parameters, of "mass" (with payload) and of the
+# numbers of cells. Losses, loads and limits are the same share of the power at the same acceleration and speed in any
+# vehicle; noises and offsets of sensors are the same share of the pack's size, its other resistances of its cells'.
+MASS = "vehicle_mass"
+ELECTRONICS = "vehicle_mass^0.8"  # lights and control: a car's are not fifteen times a scooter's
+ROTATION = "vehicle_mass wheel_radius^2"
+TORQUE = "mass wheel_radius gear_ratio"
+MOTOR_CURRENT = "mass wheel_radius gear_ratio torque_constant^-1"
+MOTOR_RESISTANCE = "mass^-1 wheel_radius^-2 gear_ratio^-2 torque_constant^2"
+CELLS = "cells_parallel cell_capacity cells_series"
+PACK_CURRENT = "cells_parallel cell_capacity"
+PACK_RESISTANCE = "cells_series cells_parallel^-1 cell_capacity^-1"
+
 VEHICLE_PARAMETERS = (
     Parameter("vehicle_mass", "kg", 105, 5, 5, 5000, "GenZe 2.0 data sheet", required=True),
     Parameter("payload_mass", "kg", 80, 12, 0, 3000, "rider and what he carries"),
     Parameter("wheel_radius", "m", 0.245, 0.005, 0.04, 0.6, "effective, of the driven wheel", required=True),
-    Parameter("wheelbase", "m", 1.32, 0.02, 0.3, 6, "GenZe 2.0 data sheet"),
-    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.05, 4, "rear axle to centre of gravity"),
+    Parameter("wheelbase", "m", 1.32, 0.02, 0.3, 6, "GenZe 2.0 data sheet", grows_with="vehicle_mass^0.25"),
+    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.05, 4, "rear axle to centre of gravity", grows_with="wheelbase"),
     Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
-    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 50, "wheel and tyre"),
-    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 50, "wheel, tyre and hub motor"),
+    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 50, "wheel and tyre", grows_with=ROTATION),
+    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 50, "wheel, tyre and hub motor", grows_with=ROTATION),
     Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed: 0.2 for a reduction of 5"),
     Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
-    Parameter("yaw_inertia", "kg·m²", 28, 6, 0.1, 20000, "Cossalter 2006, ch. 7: m·(0.39 m)² with rider"),
+    Parameter(
+        "yaw_inertia",
+        "kg·m²",
+        prior=28,
+        prior_sd=6,
+        low=0.1,
+        high=20000,
+        source="Cossalter 2006, ch. 7: m·(0.39 m)² with rider",
+        grows_with="mass wheelbase^2",
+    ),
     Parameter("caster_angle", "rad", 0.46, 0.04, 0.1, 0.8, "26 degrees: Cossalter 2006, sec. 1.3, scooters 24 to 28"),
     Parameter("tyre_crown_radius", "m", 0.05, 0.008, 0.001, 0.15, "half the width of a 100 mm scooter tyre"),
     Parameter("cornering_stiffness_front", "1/rad", 16, 4, 2, 60, "per load: Pacejka 2012, ch. 11: 14 to 19"),
@@ -137,22 +167,51 @@ VEHICLE_PARAMETERS = (
     Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
     Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "what the motor's speed sensor shows over what is"),
-    Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 5000, "most braking torque at the motor's shaft"),
+    Parameter(
+        "regeneration_torque_limit",
+        "N·m",
+        prior=19,
+        prior_sd=3,
+        low=0,
+        high=5000,
+        source="most braking torque at the motor's shaft",
+        grows_with=TORQUE,
+    ),
 )
 
 
 @dataclass(frozen=True)
-class Variation:
-    """How a healthy vehicle may differ from an effect's equation: a factor on its term."""
+class Equation:
+    """A function of an effect's file, with the names of its arguments."""
 
-    factor: Callable[..., Any]
-    quantities: tuple[str, ...]
-    keywords: tuple[str, ...]
+    function: Callable[..., Any]
+    quantities: tuple[str, ...]  # positional, in order
+    parameters: tuple[str, ...]  # by keyword
 
-    def of(self, quantities: Mapping[str, Any], values: Mapping[str, float]) -> Any:
-        """The factor at these quantities and nuisances."""
-        read = [quantities[name] for name in self.quantities]
-        return self.factor(*read, **{name: values[name] for name in self.keywords})
+    @classmethod
+    def of(cls, function: Callable[..., Any]) -> Equation:
+        """Read the names from the signature."""
+        arguments = inspect.signature(function).parameters.values()
+        keywords = tuple(a.name for a in arguments if a.kind is a.KEYWORD_ONLY)
+        return cls(function, tuple(a.name for a in arguments if a.kind is not a.KEYWORD_ONLY), keywords)
+
+    def __call__(self, *quantities: Any, **parameters: float) -> Any:
+        """The value."""
+        return self.function(*quantities, **parameters)
+
+    def at(self, quantities: Mapping[str, Any], parameters: Mapping[str, float]) -> Any:
+        """The value, with arguments by name."""
+        return self.with_parameters(parameters)(*[quantities[name] for name in self.quantities])
+
+    def with_parameters(self, parameters: Mapping[str, float]) -> Callable[..., Any]:
+        """A function of the quantities alone."""
+        values, f = {name: parameters[name] for name in self.parameters}, self.function
+        if not isinstance(f, FunctionType):
+            return partial(f, **values)
+        # A simulation calls it a hundred times a second: defaults of a copy take half the time of a `partial`.
+        copy = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
+        copy.__kwdefaults__ = values
+        return copy
 
 
 @dataclass(frozen=True)
@@ -162,51 +221,61 @@ class Effect:
     name: str
     port: Port
     parameters: tuple[Parameter, ...]
-    quantities: tuple[str, ...]
-    keywords: tuple[str, ...]  # parameters that the term takes: its own and the vehicle's
-    term: Callable[..., Any]
+    term: Equation
     doc: str
-    decay: Callable[..., Any] | None = None
-    decay_quantities: tuple[str, ...] = ()
-    decay_keywords: tuple[str, ...] = ()
+    decay: Equation | None = None  # its quantities are those after ``dt``
+    variation: Equation | None = None
     shown_by: str = ""
-    variation: Variation | None = None
     stores_energy: bool = False
     turning_loss: bool = False
-    strengths: tuple[str, ...] = ()  # parameters that change where it is found, the one that is reported first
+    strengths: tuple[str, ...] = ()  # parameters that change where it is found; the first is reported first
     varies: bool = False  # from ride to ride by itself
-    cause: tuple[str, str] | None = None  # name and equation of a change, of an effect that every model has
+    cause: tuple[str, str] | None = None  # name and equation of a change, for an effect of every model
 
     @property
     def reads(self) -> frozenset[str]:
-        """The quantities that it needs, for its term and its decay."""
-        return frozenset((*self.quantities, *self.decay_quantities))
+        """The quantities that term and decay need."""
+        return frozenset((*self.term.quantities, *(self.decay.quantities if self.decay else ())))
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """The parameters that term and decay need."""
+        return frozenset((*self.term.parameters, *(self.decay.parameters if self.decay else ())))
 
     @property
     def file(self) -> Path:
-        """The Python file that it was loaded from."""
-        return Path(inspect.getfile(self.term))
+        """The Python file from which it was loaded."""
+        return Path(inspect.getfile(self.term.function))
 
-    def __reduce__(self) -> tuple[Callable[..., Effect], tuple[str, str]]:
-        """Pickled as its file: another process does not know the modules of a user's own."""
-        return _again, (self.name, str(self.file))
+    def __reduce__(self) -> tuple[Callable[..., Effect], tuple[str, Path]]:
+        """Pickle the file: another process does not know the modules of a user's folder."""
+        return load_effect, (self.name, self.file.parent)
 
 
-def _again(name: str, file: str) -> Effect:
-    """The effect `name` of a Python file, as another process knew it."""
-    return load_effect(name, Path(file).parent)
+# --- finding and loading ------------------------------------------------------------------------------------------
 
 
 @cache
 def known_effects() -> tuple[str, ...]:
-    """The names of the effects that come with the package."""
-    from gz_onboard.physics import effects
+    """The names of the package's effects."""
+    return effects_in(PACKAGE_EFFECTS)
 
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(effects.__path__)))
+
+def effects_in(folder: Path) -> tuple[str, ...]:
+    """The names of the effects in `folder`; files that begin with _ do not count. InputError if it does not exist."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of effects")
+    return tuple(sorted(file.stem for file in folder.glob("*.py") if not file.stem.startswith("_")))
+
+
+def effect_file(name: str, folder: Path) -> Path | None:
+    """The file of the effect `name` in `folder` itself; None if there is none."""
+    file = folder / f"{name}.py"
+    return file if file.name == f"{name}.py" and file.is_file() else None
 
 
 def load_effect(name: str, folder: Path | None = None) -> Effect:
-    """The effect `name`, from `folder` if it has one of that name, else the package's own."""
+    """The effect `name`: from `folder` if it has a file of that name, else from the package."""
     if folder and (file := effect_file(name, folder)):
         try:
             return _effect(name, _import_file(name, file))
@@ -220,24 +289,9 @@ def load_effect(name: str, folder: Path | None = None) -> Effect:
     return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
 
 
-def effect_file(name: str, folder: Path) -> Path | None:
-    """The file of the effect `name` in `folder` itself; None if there is none."""
-    file = folder / f"{name}.py"
-    return file if file.name == f"{name}.py" and file.is_file() else None
-
-
-def effects_in(folder: Path) -> tuple[str, ...]:
-    """The names of the effects in a user's folder (files that begin with _ are none). InputError if there is none."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of effects")
-    return tuple(sorted(file.stem for file in folder.glob("*.py") if not file.stem.startswith("_")))
-
-
-@cache
-def _others_parameters() -> frozenset[str]:
-    """The names of the parameters that the package's effects declare."""
-    modules = (importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects())
-    return frozenset(parameter.name for module in modules for parameter in module.PARAMETERS)
+def failed(file: Path, error: BaseException) -> InputError:
+    """The error to raise about an effect's file whose code raised `error`."""
+    return InputError(f"{file}: {type(error).__name__}: {error}")
 
 
 def _import_file(name: str, file: Path) -> ModuleType:
@@ -245,63 +299,152 @@ def _import_file(name: str, file: Path) -> ModuleType:
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    # Not `exec_module`, which would take bytecode from a folder beside the file that may be anybody's.
+    # Not `exec_module`, which would take bytecode from a folder next to the file that may be anybody's.
     exec(compile(file.read_bytes(), file, "exec", dont_inherit=True), module.__dict__)
     return module
 
 
-def failed(file: Path, error: BaseException) -> InputError:
-    """The error to raise about an effect's file whose code raised `error`."""
-    return InputError(f"{file}: {type(error).__name__}: {error}")
+@cache
+def _package_parameters() -> frozenset[str]:
+    """The names of the parameters of the vehicle and of the package's effects."""
+    modules = (importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects())
+    return frozenset(p.name for declared in (VEHICLE_PARAMETERS, *(m.PARAMETERS for m in modules)) for p in declared)
 
 
 def _effect(name: str, module: ModuleType) -> Effect:
+    """The effect of a module, checked."""
     file = module.__file__
     for attribute in ("PORT", "PARAMETERS", "term"):
         if not hasattr(module, attribute):
             raise InputError(f"{file}: an effect needs {attribute}")
-    quantities, parameters = _arguments(module.term)
-    decay = getattr(module, "decay", None)
-    decay_quantities: tuple[str, ...] = ()
-    decay_parameters: tuple[str, ...] = ()
-    if decay is not None:
-        decay_quantities, decay_parameters = _arguments(decay)
-        if decay_quantities[:1] != ("dt",):
+    equations = {key: Equation.of(getattr(module, key)) for key in ("decay", "variation") if hasattr(module, key)}
+    if decay := equations.get("decay"):
+        if decay.quantities[:1] != ("dt",):
             raise InputError(f"{file}: the first argument of decay must be dt")
-        decay_quantities = decay_quantities[1:]
-    for quantity in (*quantities, *decay_quantities):
-        if quantity not in QUANTITIES:
-            raise InputError(f"{file}: no quantity is called {quantity!r}{nearest(quantity, QUANTITIES)}")
-    declared = [parameter.name for parameter in module.PARAMETERS]
-    taken = {*parameters, *decay_parameters}
-    foreign = taken - {*declared, *(parameter.name for parameter in VEHICLE_PARAMETERS)}
-    if set(declared) - taken or (foreign and foreign - _others_parameters()):
-        raise InputError(f"{file}: PARAMETERS declares {declared}, term and decay take {sorted(taken)}")
-    if not isinstance(module.PORT, Port):
-        raise InputError(f"{file}: PORT must be one of {', '.join(f'Port.{port.name}' for port in Port)}")
-    return Effect(
+        equations["decay"] = replace(decay, quantities=decay.quantities[1:])
+    declared = tuple(parameter.name for parameter in module.PARAMETERS)
+    traits = ("shown_by", "stores_energy", "turning_loss", "strengths", "varies", "cause")
+    given = {trait: getattr(module, trait.upper()) for trait in traits if hasattr(module, trait.upper())}
+    effect = Effect(
         name=name,
         port=module.PORT,
         parameters=tuple(module.PARAMETERS),
-        quantities=quantities,
-        keywords=parameters,
-        term=module.term,
+        term=Equation.of(module.term),
         doc=inspect.getdoc(module) or "",
-        decay=decay,
-        decay_quantities=decay_quantities,
-        decay_keywords=decay_parameters,
-        shown_by=getattr(module, "SHOWN_BY", ""),
-        variation=Variation(vary, *_arguments(vary)) if (vary := getattr(module, "variation", None)) else None,
-        stores_energy=getattr(module, "STORES_ENERGY", False),
-        turning_loss=getattr(module, "TURNING_LOSS", False),
-        strengths=getattr(module, "STRENGTHS", tuple(declared[:1])),
-        varies=getattr(module, "VARIES", False),
-        cause=getattr(module, "CAUSE", None),
+        **{"strengths": declared[:1]} | equations | given,
     )
+    for quantity in effect.reads - QUANTITIES.keys():
+        raise InputError(f"{file}: no quantity is called {quantity!r}{nearest(quantity, QUANTITIES)}")
+    foreign = effect.takes.difference(declared)
+    if not effect.takes.issuperset(declared) or (foreign and foreign - _package_parameters()):
+        raise InputError(f"{file}: PARAMETERS declares {list(declared)}, term and decay take {sorted(effect.takes)}")
+    if not isinstance(module.PORT, Port):
+        raise InputError(f"{file}: PORT must be one of {', '.join(f'Port.{port.name}' for port in Port)}")
+    return effect
 
 
-def _arguments(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The names of the (positional, keyword-only) arguments."""
-    arguments = inspect.signature(function).parameters.values()
-    keywords = tuple(a.name for a in arguments if a.kind is a.KEYWORD_ONLY)
-    return tuple(a.name for a in arguments if a.kind is not a.KEYWORD_ONLY), keywords
+# --- the effects of a vehicle file, whose code runs only if nobody else can change it ---------------------------------
+
+BASE_EFFECTS = (
+    "aerodynamic_drag",
+    "rolling_resistance",
+    "grade_force",
+    "inertia",
+    "motor_copper_loss",
+    "motor_iron_loss",
+    "inverter_loss",
+    "auxiliary_load",
+)
+"""The effects of every vehicle: the model of a file that lists none."""
+ROOT = 0
+
+
+def read_effects(
+    vehicle: Table, folder: Path | None = None, users: Collection[int] | None = None
+) -> tuple[Effect, ...]:
+    """The effects that the vehicle file lists, or `BASE_EFFECTS`.
+
+    An effect is looked for in `folder`, in the file's own ``effects_folder``, then in the package. Effects of the
+    file's folder are code that came with data: they run only if nobody but `users` (their ids; by default root and the
+    present user) can change the file or the effect. InputError otherwise.
+    """
+    if folder and not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of effects")
+    table = vehicle.table("model")
+    table.only(["effects", "effects_folder"])
+    own = _own_folder(table)
+    names = table.texts("effects", "names of effects") if "effects" in table.values else BASE_EFFECTS
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise table.error(f"{shown(twice)} is there twice", "effects")
+    effects = []
+    for name in names:
+        table.check_path("effects", name)
+        try:
+            given = effect_file(name, folder) if folder else None
+            file = effect_file(name, own) if own and not given else None
+            if file:
+                _check_trust(vehicle.file, file, trusted_users() if users is None else users)
+            effects.append(load_effect(name, own if file else folder or own))
+        except Exception as error:
+            raise table.error(str(error), "effects") from error
+    return tuple(effects)
+
+
+def _own_folder(model: Table) -> Path | None:
+    """The file's ``effects_folder``, which must lie in the file's folder."""
+    if "effects_folder" not in model.values:
+        return None
+    name = model.check_path("effects_folder", model.text("effects_folder"))
+    folder = model.file.parent / name
+    if Path(name).is_absolute() or not folder.resolve().is_relative_to(model.file.parent.resolve()):
+        raise model.error(f"{name!r} is not below the vehicle file's own folder", "effects_folder")
+    if not folder.is_dir():
+        raise model.error(f"no folder {folder}", "effects_folder")
+    return folder
+
+
+def _check_trust(vehicle: Path, effect: Path, users: Collection[int]) -> None:
+    """InputError if `effect` leaves the vehicle file's folder by a link, or others can change it or the file."""
+    if not effect.resolve().is_relative_to(vehicle.parent.resolve()):
+        raise InputError(f"{effect} is a link that leads out of the vehicle file's folder")
+    for file in (vehicle, effect):
+        if reason := changeable(file, users):
+            raise InputError(
+                f"{effect.name} beside the file is code, and not run: {reason}; "
+                "`run` and `discover` take a folder that you trust by --effects"
+            )
+
+
+def trusted_users() -> frozenset[int]:
+    """The users whose files may run as code: root and the present user."""
+    return frozenset((ROOT, os.geteuid()))
+
+
+def changeable(file: Path, users: Collection[int]) -> str | None:
+    """Why others than `users` (their ids) can change `file` or replace it; None if they cannot.
+
+    Like sshd, it checks the file, after following links, and every folder above it. OSError if there is no file.
+    """
+    place = file.resolve(strict=True)
+    for part in (place, *place.parents):
+        status = part.stat()
+        if status.st_uid not in users:
+            return f"{part} belongs to user {status.st_uid}"
+        sticky = part != place and status.st_mode & stat.S_ISVTX  # in /tmp, users can replace only their own files
+        by_group = status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_uid, status.st_gid)
+        if (status.st_mode & stat.S_IWOTH or by_group) and not sticky:
+            return f"{part} can be written by others (chmod go-w)"
+    return None
+
+
+def _is_private_group(user: int, group: int) -> bool:
+    """Whether the group is the user's own, without other members, as Debian gives each user."""
+    import grp
+    import pwd
+
+    try:
+        entry = grp.getgrgid(group)
+        return entry.gr_name == pwd.getpwuid(user).pw_name and not entry.gr_mem
+    except KeyError:
+        return False

@@ -1,41 +1,20 @@
-"""The forward model: a list of effects between road and battery, and the ledger of what each takes.
+"""The forward model: effects between road and battery, and the ledger of the power that each takes.
 
-Backward in the sense of simulation (speed in, power out), light enough for on board; floats and numpy arrays alike.
+Backward in the sense of simulation (speed in, power out); of floats and numpy arrays alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping
-from functools import partial
-from operator import itemgetter
-from pathlib import Path
-from types import FunctionType
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from functools import cache, partial
+from typing import Any
 
 from gz_onboard.constants import KELVIN
-from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import HALF_FULL, QUICK, Battery, Overpotential
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
-from gz_onboard.physics.elementary import STANDSTILL, sqrt
+from gz_onboard.physics.effect import QUANTITIES, Effect, Port
+from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxation, relaxed, sqrt
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.relaxation import mean_response, relaxation, relaxed
 from gz_onboard.physics.sensors import road_speed
-from gz_onboard.physics.trust import changeable, trusted_users
-
-if TYPE_CHECKING:
-    from gz_onboard.toml import Table
-
-BASE_EFFECTS = (
-    "aerodynamic_drag",
-    "rolling_resistance",
-    "grade_force",
-    "inertia",
-    "motor_copper_loss",
-    "motor_iron_loss",
-    "inverter_loss",
-    "auxiliary_load",
-)
-"""What a vehicle file gets that lists none: what every vehicle has."""
 
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 
@@ -49,18 +28,19 @@ def air_density(temperature: float, altitude: float = 0.0) -> float:
 class Bound:
     """An effect with the values of its parameters.
 
-    term: its value at quantities by name, floats or arrays; of an effect with memory, what it settles at.
+    term: its value as a function of quantities by name, floats or arrays; of an effect with memory, the value at which
+    it settles. bare_term, bare_decay: the same of quantities by position.
     """
 
     def __init__(self, effect: Effect, parameters: Mapping[str, float]) -> None:
         self.effect = effect
-        self._values = {name: parameters[name] for name in (*effect.keywords, *effect.decay_keywords)}
-        self.term = _with(effect.term, effect.quantities, {name: parameters[name] for name in effect.keywords})
-        values = {name: parameters[name] for name in effect.decay_keywords}
-        self._decay = _valued(effect.decay, values) if effect.decay else None
+        self._values = {name: parameters[name] for name in effect.takes}
+        self.bare_term = effect.term.with_parameters(parameters)
+        self.bare_decay = effect.decay and effect.decay.with_parameters(parameters)
+        self.term = _reader(effect.term.quantities)(self.bare_term)
 
     def __reduce__(self) -> tuple[type[Bound], tuple[Effect, dict[str, float]]]:
-        """Pickled as effect and values: another process does not know the functions of a user's own file."""
+        """Pickle effect and values: another process does not know the functions of a user's file."""
         return Bound, (self.effect, self._values)
 
     def __call__(self, quantities: Mapping[str, Any]) -> Any:
@@ -68,19 +48,19 @@ class Bound:
         return self.term(quantities)
 
     def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
-        """The factor that its state keeps over `dt` [s]; of an effect without memory 0."""
-        if self._decay is None:
+        """The factor by which its state decays over `dt` [s]; 0 for an effect without memory."""
+        if self.effect.decay is None or self.bare_decay is None:
             return 0.0
-        return self._decay(dt, *[quantities[name] for name in self.effect.decay_quantities])
+        return self.bare_decay(dt, *[quantities[name] for name in self.effect.decay.quantities])
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
-        """Its value after `dt` [s] from `state`."""
+        """Its value `dt` [s] after `state`."""
         return float(relaxed(state, self(quantities), self.decay(dt, quantities)))
 
     def series(self, dt: Any, quantities: Mapping[str, Any], before: bool = False) -> Any:
-        """Its values at the ends of steps of `dt` [s], with the quantities in them: scalars, or arrays of shape (n,).
+        """Its values (n,) at the ends of steps of `dt` [s], starting from 0.
 
-        Shape (n,); n = 1 if all are scalars. From nothing remembered. before: at the beginnings instead.
+        quantities: in each step, scalars or arrays (n,); n = 1 if all are scalars. before: at the beginnings instead.
         """
         import numpy as np
 
@@ -92,50 +72,53 @@ class Bound:
         return relaxation(target, decay, before=before)
 
 
-def _valued(function: Callable[..., Any], values: Mapping[str, float]) -> Callable[..., Any]:
-    """`function` with these keyword arguments.
+def _call(function: str, names: Iterable[str]) -> str:
+    """Source of a call of `function` with the quantities `names` out of a dictionary ``q``."""
+    return f"{function}({', '.join(f'q[{name!r}]' for name in names)})"
 
-    A simulation calls it a hundred times for each second ridden: values as the defaults of a copy take half the time
-    that a `partial` takes.
+
+@cache
+def _reader(names: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[[Mapping[str, Any]], Any]]:
+    """Turns a function of the quantities `names` into one of a dictionary of quantities."""
+    return eval(f"lambda function: lambda q: {_call('function', names)}")  # type: ignore[no-any-return]
+
+
+def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """A function from quantities (floats) to the values of `effects`, to be called once each step of `dt` [s].
+
+    Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
+    loops and layers of calls: a simulation calls it a hundred times for each second ridden.
     """
-    f = function
-    if isinstance(f, FunctionType) and f.__code__.co_kwonlyargcount == len(values):
-        copy = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
-        copy.__kwdefaults__ = dict(values)
-        return copy
-    return partial(function, **values)
-
-
-def _with(
-    function: Callable[..., Any], names: tuple[str, ...], values: Mapping[str, float]
-) -> Callable[[Mapping[str, Any]], Any]:
-    """`function` of the quantities called `names`; items one by one take two thirds of the time of a tuple of them."""
-    term = _valued(function, values)
-    match names:
-        case ():
-            return lambda q: term()
-        case (a,):
-            return lambda q: term(q[a])
-        case (a, b):
-            return lambda q: term(q[a], q[b])
-        case (a, b, c):
-            return lambda q: term(q[a], q[b], q[c])
-        case _:
-            read = itemgetter(*names)
-            return lambda q: term(*read(q))
+    scope: dict[str, Any] = {}
+    lines = []
+    for i, bound in enumerate(effects):
+        decay = bound.effect.decay
+        scope[f"term{i}"] = bound.bare_term
+        call = _call(f"term{i}", bound.effect.term.quantities)
+        if decay and bound.bare_decay and dt is not None:
+            scope[f"value{i}"], scope[f"decay{i}"] = 0.0, partial(bound.bare_decay, dt)
+            if not decay.quantities:
+                scope[f"kept{i}"] = bound.bare_decay(dt)
+            kept = _call(f"decay{i}", decay.quantities) if decay.quantities else f"kept{i}"
+            lines += [f"global value{i}", f"k = {kept}"]
+            call = f"k * value{i} + (1 - k) * {call}"
+        lines.append(f"value{i} = {call}")
+    values = "".join(f"value{i}, " for i in range(len(effects)))
+    exec("\n    ".join(["def values(q):", *lines, f"return ({values})"]), scope)
+    return scope["values"]  # type: ignore[no-any-return]
 
 
 Recall = Callable[[Bound, Mapping[str, Any]], Any]
 """The value of an effect with memory at these quantities."""
 
 
-def over(dt: Any, before: bool = False) -> Recall:
-    """For arrays over steps of `dt` [s], in their order, from nothing remembered: see `Bound.series`."""
-    return lambda effect, quantities: effect.series(dt, quantities, before)
+def over(dt: Any) -> Recall:
+    """For arrays over consecutive steps of `dt` [s], starting from 0: see `Bound.series`."""
+    return lambda effect, quantities: effect.series(dt, quantities)
 
 
 def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
-    """One step of `dt` [s] from `states`, by the names of the effects, which it moves on; 0 for what is not there."""
+    """One step of `dt` [s] from `states`, by the names of the effects, which it updates; 0 for a missing one."""
 
     def recall(effect: Bound, quantities: Mapping[str, Any]) -> float:
         name = effect.effect.name
@@ -145,83 +128,18 @@ def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
     return recall
 
 
-def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float]:
-    """The value of `effect` as a function that is called once each step of `dt` [s]; from nothing remembered."""
-    if effect.effect.decay is None:
-        return effect.term
-    state = 0.0
-
-    def value(quantities: Mapping[str, Any]) -> float:
-        nonlocal state
-        state = effect.step(state, dt, quantities)
-        return state
-
-    return value
-
-
-BURST = 10.0  # s: a load in traffic
-UNMOVED = 0.01  # of a burst: what shows less of it sees the mean current only
-
-
-def _share_of_bursts(effect: Bound) -> float | None:
-    """What of a burst an effect in the cells shows in the mean over it; None if that depends on how they are."""
-    return None if effect.effect.decay_quantities else mean_response(effect.decay(BURST, {}))
-
-
-def share_that_ages(effect: Bound) -> float:
-    """How much of an effect in the cells grows with their resistance, which is learned from changes within `QUICK`.
-
-    What takes longer to show is not in those: diffusion, whose growth with age is another.
-    """
-    return 1.0 if effect.effect.decay_quantities else 1 - float(effect.decay(QUICK, {}))
-
-
-STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, a heater
-STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
-
-
-def standing_load(current: float, voltage: float, auxiliary_power: float) -> float:
-    """How much of a pack's first `current` [A] at `voltage` [V] has flowed for a while already.
-
-    More than a standing vehicle draws is a rider who pulls away, or a sensor's error, as likely as a load.
-    """
-    most = STANDING_LOADS * auxiliary_power / voltage if voltage > 0 else 0.0
-    return min(max(current, -most), most)
-
-
-def first_soc(
-    effects: Iterable[Bound], battery: Battery, first: tuple[float, float], temperature: float, load: float
-) -> float:
-    """The SOC out of the pack's first voltage [V] and current [A] of a ride.
-
-    effects: in the cells; temperature in degC; load: the current [A] that has flowed for `STOOD`, from rest, see
-    `standing_load`. The RC pair, slower than most of them, is taken to be at rest still. It may be below 0 or above 1,
-    see `Battery.soc_at_load`.
-    """
-    voltage, current = first
-    cell, capacity = current / battery.cells_parallel, battery.cell_capacity(temperature)
-    q = all_quantities(
-        cell_current=load / battery.cells_parallel, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity
-    )
-    lost = float(sum(effect(q) * (1 - effect.decay(STOOD, q)) for effect in effects))
-    return battery.soc_at_load(battery.cell_voltage(voltage, current) + lost, cell, temperature)
-
-
 def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
-    """The value of `effect`; recall: gives that of one with memory, which without it is what it settles at."""
+    """The value of `effect`; with memory, as `recall` gives it, or settled without `recall`."""
     return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
 
 
 def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
     """The sum of the values of `effects`: see `value_of`."""
-    result: Any = 0.0
-    for effect in effects:
-        result = result + value_of(effect, quantities, recall)
-    return result
+    return sum((value_of(effect, quantities, recall) for effect in effects), 0.0)
 
 
 def all_quantities(**known: Any) -> dict[str, Any]:
-    """What effects read, floats or arrays: `known`, the cosine of its ``grade``, and 0 for everything else."""
+    """All quantities that effects read, floats or arrays: `known`, the cosine of its ``grade``, and 0 for the rest."""
     cosine = sqrt(1 - known["grade"] * known["grade"]) if "grade" in known else 1.0
     return dict.fromkeys(QUANTITIES, 0.0) | {"grade_cosine": cosine} | known
 
@@ -232,48 +150,43 @@ def drag_torque(power: Any, motor_speed: Any) -> Any:
 
 
 class Model:
-    """The effects of one vehicle with its parameters.
-
-    reads: the quantities that its effects need. cell_voltage: the effects in the cells, by name.
-    """
+    """The effects of one vehicle with its parameters. reads: the quantities that the effects need."""
 
     def __init__(self, effects: tuple[Effect, ...], parameters: Parameters) -> None:
         self.effects = effects
         self.parameters = parameters
-        self._at: dict[Port, list[tuple[str, Bound]]] = {port: [] for port in Port}
+        self._at: dict[Port, list[Bound]] = {port: [] for port in Port}
         for effect in effects:
-            self._at[effect.port].append((effect.name, Bound(effect, parameters)))
-        self.reads: frozenset[str] = frozenset(name for effect in effects for name in effect.reads)
-        self.cell_voltage = self._at[Port.CELL_VOLTAGE]
+            self._at[effect.port].append(Bound(effect, parameters))
+        self.reads: frozenset[str] = frozenset().union(*(effect.reads for effect in effects))
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
         self._motor_per_speed = 1 / road_speed(1.0, parameters)
 
     def at(self, *ports: Port) -> list[Bound]:
         """The effects at these ports."""
-        return [effect for port in ports for _, effect in self._at[port]]
+        return [effect for port in ports for effect in self._at[port]]
 
     def idle_loss(self, quantities: Mapping[str, Any]) -> Any:
-        """What the motor loses [W] turning without current: drag on the shaft, which its current makes up for."""
-        return total(self.at(Port.MOTOR_LOSS), {**quantities, "torque": 0.0, "motor_current": 0.0})
+        """Loss of the motor [W] turning without current: drag on the shaft, which the motor's current makes up for."""
+        return total(self._at[Port.MOTOR_LOSS], {**quantities, "torque": 0.0, "motor_current": 0.0})
 
     def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
-        """The ledger [W] of moving as `quantities` say: what each effect takes out of the pack, by name.
+        """The ledger [W]: the power that each effect takes out of the pack, by name, moving as `quantities` say.
 
-        `quantities` are those that the model `reads`, but for motor_speed, torque and motor_current, which follow
-        from the road load. recall: gives the value of an effect with memory; without one, what it settles at. Effects
-        in the cells are not in it: they are behind the pack's terminals.
-        ``brakes`` is what the friction brakes turn to heat where the motor cannot brake enough. The sum of the ledger
-        is the power at the pack's terminals; kinetic and potential energy are
-        the entries ``inertia`` and ``grade_force``.
+        quantities: those that the model `reads`, without motor_speed, torque and motor_current, which follow from the
+        road load. recall: gives the value of an effect with memory; without it they are settled. Effects in the cells
+        are not included: they are behind the pack's terminals. ``brakes`` is the heat of the friction brakes where the
+        motor cannot brake enough. The sum of the ledger is the power at the pack's terminals; kinetic and potential
+        energy are the entries ``inertia`` and ``grade_force``.
         """
         q = dict(quantities)
         speed = q["speed"]
         ledger: dict[str, Any] = {}
         force = 0.0
-        for name, effect in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
-            term = value_of(effect, q, recall)
+        for bound in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
+            term = value_of(bound, q, recall)
             force = force + term
-            ledger[name] = term * speed
+            ledger[bound.effect.name] = term * speed
         motor_speed = speed * self._motor_per_speed
         wanted = force / self._motor_per_speed  # torque at the motor's shaft
         limit = -self.parameters["regeneration_torque_limit"]
@@ -283,98 +196,89 @@ class Model:
         q["torque"] = torque + drag_torque(self.idle_loss(q), motor_speed)
         q["motor_current"] = q["torque"] / self.parameters["torque_constant"]
         for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER):
-            for name, effect in self._at[port]:
-                ledger[name] = value_of(effect, q, recall)
+            for bound in self._at[port]:
+                ledger[bound.effect.name] = value_of(bound, q, recall)
         return ledger
 
-    def overpotential(self, battery: Battery, beside: Mapping[str, float] | None = None) -> Overpotential | None:
-        """What the terminals of `battery`'s cells lack [V] by all effects in them, settled; None without any.
+    def overpotential(self, battery: Battery, others: Mapping[str, float] | None = None) -> Overpotential | None:
+        """The voltage [V] that a cell of `battery` loses by all effects in it, settled; None without such effects.
 
-        beside: other quantities than the cells' that they may read; 0 if not given.
+        others: quantities that are not the cells' and that the effects may read; 0 if not given.
         """
-        if not self.cell_voltage:
+        effects = [(x, _share_of_bursts(x), share_that_ages(x)) for x in self._at[Port.CELL_VOLTAGE]]
+        if not effects:
             return None
-        others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
-        effects = [(x, _share_of_bursts(x), share_that_ages(x)) for x in self.at(Port.CELL_VOLTAGE)]
-        by_capacity = "cell_capacity" in self.reads
+        usual = dict.fromkeys(QUANTITIES, 0.0) | dict(others or {})
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
-            # A forecast calls it a hundred times: one dictionary for all effects, and no bursts where there are none.
-            q = others.copy()
+            q = usual.copy()
             q["soc"], q["cell_temperature"] = soc, temperature
-            if by_capacity:
-                q["cell_capacity"] = battery.cell_capacity(temperature)
+            q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
             for effect, known, ages in effects:
                 q["cell_current"] = load = battery.health.carried(current, ages)
                 share = mean_response(effect.decay(BURST, q)) if known is None else known
                 if form_factor_squared == 1 or share < UNMOVED:
-                    lost += effect(q)
+                    lost += effect.term(q)
                     continue
-                # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
+                # The charge flows in bursts. An effect that is fast enough follows the current, not its mean. A gamma
+                # distribution of currents of this form factor, weighted with the charge, has the mean and sd of two
+                # currents, which tell what an effect loses that does not grow in proportion to the current.
                 bursts = 1 + (form_factor_squared - 1) * share
-                # A gamma distribution of currents of this form factor, as the charge sees it: its mean and its sd are
-                # those of two currents, which tell what an effect loses that does not grow with the current.
                 apart = sqrt((bursts - 1) / bursts)
                 for part in (1 - apart, 1 + apart):
                     q["cell_current"] = part * bursts * load
-                    lost += effect(q) / 2
+                    lost += effect.term(q) / 2
             return lost
 
         return settled
 
 
-def read_model(vehicle: Table, folder: Path | None = None, users: Collection[int] | None = None) -> tuple[Effect, ...]:
-    """The effects that the vehicle file lists, `BASE_EFFECTS` if it lists none.
+# --- effects in the cells -----------------------------------------------------------------------------------------
 
-    An effect is looked for in `folder`, in the file's own ``effects_folder``, and among the package's. That of the file
-    is code that came with data: it runs only if nobody but `users` (their ids; root and who runs us if not given) can
-    change the file or the effect. InputError otherwise.
+BURST = 10.0  # s: a load in traffic
+UNMOVED = 0.01  # an effect that shows less of a burst sees only the mean current
+STOOD = 60.0  # s: duration of the load before a ride's first voltages: lights, a heater
+STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
+
+
+def _share_of_bursts(effect: Bound) -> float | None:
+    """How much of a burst an effect in the cells shows in the mean over it; None if the cells' state decides."""
+    decay = effect.effect.decay
+    return None if decay and decay.quantities else mean_response(effect.decay(BURST, {}))
+
+
+def share_that_ages(effect: Bound) -> float:
+    """How much of an effect in the cells grows with their resistance, which is learned from changes within `QUICK`.
+
+    Slower effects, such as diffusion, do not show in those changes, and grow differently with age.
     """
-    if folder and not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of effects")
-    table = vehicle.table("model")
-    table.only(["effects", "effects_folder"])
-    own = _own_folder(table)
-    names = table.texts("effects", "names of effects") if "effects" in table.values else BASE_EFFECTS
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise table.error(f"{shown(twice)} is there twice", "effects")
-    effects = []
-    for name in names:
-        table.check_path("effects", name)
-        try:
-            given = effect_file(name, folder) if folder else None
-            if own and not given and (file := effect_file(name, own)):
-                _check_trust(vehicle.file, file, trusted_users() if users is None else users)
-                effects.append(load_effect(name, own))
-            else:
-                effects.append(load_effect(name, folder or own))
-        except Exception as error:
-            raise table.error(str(error), "effects") from error
-    return tuple(effects)
+    decay = effect.effect.decay
+    return 1.0 if decay and decay.quantities else 1 - float(effect.decay(QUICK, {}))
 
 
-def _own_folder(model: Table) -> Path | None:
-    """The file's own ``effects_folder``, which must lie in the file's."""
-    if "effects_folder" not in model.values:
-        return None
-    name = model.check_path("effects_folder", model.text("effects_folder"))
-    folder = model.file.parent / name
-    if Path(name).is_absolute() or not folder.resolve().is_relative_to(model.file.parent.resolve()):
-        raise model.error(f"{name!r} is not below the vehicle file's own folder", "effects_folder")
-    if not folder.is_dir():
-        raise model.error(f"no folder {folder}", "effects_folder")
-    return folder
+def standing_load(current: float, voltage: float, auxiliary_power: float) -> float:
+    """How much [A] of a pack's first `current` [A] at `voltage` [V] has already flowed for a while.
+
+    More than the load of a standing vehicle is a rider who pulls away, or a sensor's error, as likely as a load.
+    """
+    most = STANDING_LOADS * auxiliary_power / voltage if voltage > 0 else 0.0
+    return min(max(current, -most), most)
 
 
-def _check_trust(vehicle: Path, effect: Path, users: Collection[int]) -> None:
-    """InputError if `effect` leaves the vehicle file's folder by a link, or others can change it or the file."""
-    if not effect.resolve().is_relative_to(vehicle.parent.resolve()):
-        raise InputError(f"{effect} is a link that leads out of the vehicle file's folder")
-    for file in (vehicle, effect):
-        if reason := changeable(file, users):
-            raise InputError(
-                f"{effect.name} beside the file is code, and not run: {reason}; "
-                "`run` and `discover` take a folder that you trust by --effects"
-            )
+def first_soc(
+    effects: Iterable[Bound], battery: Battery, first: tuple[float, float], temperature: float, load: float
+) -> float:
+    """The SOC from the pack's first voltage [V] and current [A] of a ride.
+
+    effects: in the cells. temperature: degC. load: the current [A] that has flowed for `STOOD`, from rest, see
+    `standing_load`; the RC pair, slower than most effects, is taken to be at rest still. The SOC may be below 0 or
+    above 1, see `Battery.soc_at_load`.
+    """
+    voltage, current = first
+    cell, capacity = current / battery.cells_parallel, battery.cell_capacity(temperature)
+    q = all_quantities(
+        cell_current=load / battery.cells_parallel, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity
+    )
+    lost = float(sum(effect(q) * (1 - effect.decay(STOOD, q)) for effect in effects))
+    return battery.soc_at_load(battery.cell_voltage(voltage, current) + lost, cell, temperature)

@@ -9,32 +9,27 @@ from math import hypot, log, sqrt
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY, MILD, WH_PER_KM
-from gz_onboard.physics.effect import QUANTITIES, failed
-from gz_onboard.physics.model import Bound, air_density
+from gz_onboard.physics.effect import failed
+from gz_onboard.physics.model import Bound, air_density, all_quantities
 
 if TYPE_CHECKING:
     from gz_onboard.physics.model import Model
     from gz_onboard.toml import Table
 
-
-LATERAL = 1.1  # m/s², of the eight commissioning rides; each alone 0.26 (suburban) to 1.7 (oval)
-DRIFT = 0.055  # of the eight commissioning rides, which stay in town or on one road
-ANYWHERE = 0.2  # drift of what is fast enough for any road
 TOWN_SPEED = 11.0  # m/s, the fastest of a scooter's usual riding
-CRUISE, MOTORWAY = 0.8, 36.0  # what is ridden for long: of the top speed, and at most [m/s]
-SCOOTER = 13.7, 105.0  # top speed [m/s] and mass [kg]; of kick scooters to cars it goes with the mass, about so
-MOST_UNKNOWN = 0.75  # sd of the logarithm of the consumption: twice or half
-VIBRATION = 1.3  # m/s², RMS while moving, of the median of the eight commissioning rides; each alone 1.14 to 1.43
+ANYWHERE = 0.2  # drift of a vehicle that is fast enough for any road
 
 
 @dataclass(frozen=True)
 class PriorRiding:
-    """A riding as operating points, and what the model makes of it.
+    """Expected riding, as operating points, and how well the model describes it.
 
-    points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
-    points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
-    ride to ride. drift: relative sd of what rides consume per metre, from ride to ride, before that is learned.
-    lateral_acceleration, vibration: the root mean square while moving [m/s²]; only a model that reads it asks.
+    points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: factor on the modelled energy for hills and
+    for the riding between the points. factor, factor_sd: energy measured over modelled, and its scatter from ride to
+    ride. drift: relative sd of the consumption per metre, from ride to ride, before it is learned; the default is that
+    of the eight commissioning rides, which stay in town or on one road. lateral_acceleration, vibration: root mean
+    square while moving [m/s²], for models that read them; the defaults are the means of those rides, whose own values
+    are 0.26 (suburban) to 1.7 (oval), and 1.14 to 1.43.
     """
 
     points: tuple[tuple[float, float, float], ...] = (
@@ -49,9 +44,9 @@ class PriorRiding:
     unevenness: float = 1.1
     factor: float = 1.0
     factor_sd: float = 0.15
-    drift: float = DRIFT
-    lateral_acceleration: float = LATERAL
-    vibration: float = VIBRATION
+    drift: float = 0.055
+    lateral_acceleration: float = 1.1
+    vibration: float = 1.3
 
     @cached_property
     def speed(self) -> float:
@@ -59,17 +54,28 @@ class PriorRiding:
         return sum(share * speed for share, speed, _ in self.points)
 
 
-def usual_riding(model: Model, top_speed: float | None) -> PriorRiding:
-    """The riding of a vehicle of which no more is known than `model` and its `top_speed` [m/s], if that.
+@dataclass(frozen=True)
+class UsualRiding:
+    """How a vehicle is ridden about which nothing else is known."""
 
-    A scooter rides in town as in the first part of the WMTC; what is slower, slower. What is faster may ride in town or
-    as fast as it can: the speed between at which the road load is the geometric mean of both, and not known by more
-    than what either is from that.
+    scooter_speed: float = 13.7  # m/s, top speed of the scooter that the priors describe
+    scooter_mass: float = 105.0  # kg; from kick scooters to cars, the top speed grows with about the mass
+    cruise: float = 0.8  # of the top speed: ridden for long
+    motorway: float = 36.0  # m/s, at most ridden for long
+    largest_sd: float = 0.75  # of the logarithm of the consumption: twice or half
+
+
+def usual_riding(model: Model, top_speed: float | None, usual: UsualRiding = UsualRiding()) -> PriorRiding:
+    """The riding of a vehicle of which only `model` and perhaps its `top_speed` [m/s] are known.
+
+    A scooter rides in town as in the first part of the WMTC; a slower vehicle, slower. A faster one may ride in town or
+    as fast as it can: the speed between, at which the road load is the geometric mean of both, with an uncertainty that
+    covers either.
     """
     town, p = PriorRiding(), model.parameters
-    heavier = p["vehicle_mass"] / SCOOTER[1]
-    top = top_speed or SCOOTER[0] * max(heavier**0.5, heavier**1.5)
-    fast = round(min(CRUISE * top, MOTORWAY))
+    heavier = p["vehicle_mass"] / usual.scooter_mass
+    top = top_speed or usual.scooter_speed * max(heavier**0.5, heavier**1.5)
+    fast = round(min(usual.cruise * top, usual.motorway))
     if fast <= TOWN_SPEED:
         slower = tuple((share, speed * fast / TOWN_SPEED, a) for share, speed, a in town.points)
         return replace(town, points=slower)
@@ -77,58 +83,59 @@ def usual_riding(model: Model, top_speed: float | None) -> PriorRiding:
     in_town, at_most = (rolling + drag * speed**2 for speed in (TOWN_SPEED, fast))
     ratio = sqrt((sqrt(in_town * at_most) - rolling) / drag) / TOWN_SPEED
     between = tuple((share, speed if a else speed * ratio, a) for share, speed, a in town.points)
-    unknown = min(hypot(town.factor_sd, log(at_most / in_town) / 2), MOST_UNKNOWN)
+    unknown = min(hypot(town.factor_sd, log(at_most / in_town) / 2), usual.largest_sd)
     return replace(town, points=between, factor_sd=unknown, drift=ANYWHERE)
 
 
 def read_riding(vehicle: Table, model: Model, top_speed: float | None = None) -> PriorRiding:
-    """The table ``[forecast]`` of a vehicle file; what it does not say is as in `usual_riding`.
+    """The table ``[forecast]`` of a vehicle file; a missing value is that of `usual_riding`.
 
     ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²].
     """
     table = vehicle.table("forecast")
-    table.only(["riding", "unevenness", "factor", "factor_sd", "drift", "lateral_acceleration", "vibration", "source"])
-    town = PriorRiding() if "riding" in table.values else usual_riding(model, top_speed)
-    if "riding" not in table.values:
-        points = town.points
-    else:
-        rows = table.rows("riding", 3, "share of time, speed in m/s, acceleration in m/s²", -100, 100)
-        points = tuple((share, speed, acceleration) for share, speed, acceleration in rows)
-        shares = sum(share for share, _, _ in points)
-        if not (all(share >= 0 and speed >= 0 for share, speed, _ in points) and 0.98 < shares < 1.02):
-            raise table.error(
-                f"shares and speeds must not be negative, shares add up to 1 (now {shares:.3f})", "riding"
-            )
-        if sum(share * speed for share, speed, _ in points) < 0.5:
-            raise table.error("must move", "riding")
-    return PriorRiding(
-        points,
-        table.number("unevenness", town.unevenness, 1.0, 2.0),
-        table.number("factor", town.factor, 0.1, 10.0),
-        table.number("factor_sd", town.factor_sd, 0.001, 1.0),
-        table.number("drift", town.drift, 0.0, 1.0),
-        table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
-        table.number("vibration", town.vibration, 0.0, 20.0),
-    )
+    limits = {
+        "unevenness": (1.0, 2.0),
+        "factor": (0.1, 10.0),
+        "factor_sd": (0.001, 1.0),
+        "drift": (0.0, 1.0),
+        "lateral_acceleration": (0.0, 9.0),
+        "vibration": (0.0, 20.0),
+    }
+    table.only(["riding", *limits, "source"])
+    given = "riding" in table.values
+    riding = PriorRiding() if given else usual_riding(model, top_speed)
+    points = _read_points(table) if given else riding.points
+    numbers = {name: table.number(name, getattr(riding, name), *limit) for name, limit in limits.items()}
+    return replace(riding, points=points, **numbers)
+
+
+def _read_points(table: Table) -> tuple[tuple[float, float, float], ...]:
+    rows = table.rows("riding", 3, "share of time, speed in m/s, acceleration in m/s²", -100, 100)
+    points = tuple((share, speed, acceleration) for share, speed, acceleration in rows)
+    shares = sum(share for share, _, _ in points)
+    if not (all(share >= 0 and speed >= 0 for share, speed, _ in points) and 0.98 < shares < 1.02):
+        raise table.error(f"shares and speeds must not be negative, shares add up to 1 (now {shares:.3f})", "riding")
+    if sum(share * speed for share, speed, _ in points) < 0.5:
+        raise table.error("must move", "riding")
+    return points
 
 
 def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
     """InputError if `riding` costs no energy by `model`, on a level road in mild air: then there would be no range.
 
-    Also if the code of an effect raises at it.
+    Also if the code of an effect raises an error there.
     """
-    ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
-        "grade_cosine": 1.0,
-        "mass": model.mass,
-        "air_density": air_density(MILD),
-        "motor_temperature": MILD,
-        "ambient_temperature": MILD,
-        "cell_temperature": MILD,
-        "cell_capacity": model.parameters["cell_capacity"],
-        "soc": 0.5,
-        "lateral_acceleration": riding.lateral_acceleration,
-        "vibration": riding.vibration,
-    }
+    ordinary = all_quantities(
+        mass=model.mass,
+        air_density=air_density(MILD),
+        motor_temperature=MILD,
+        ambient_temperature=MILD,
+        cell_temperature=MILD,
+        cell_capacity=model.parameters["cell_capacity"],
+        soc=0.5,
+        lateral_acceleration=riding.lateral_acceleration,
+        vibration=riding.vibration,
+    )
     for effect, (_, speed, acceleration) in product(model.effects, riding.points):
         try:
             float(Bound(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))

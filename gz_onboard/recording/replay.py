@@ -265,7 +265,8 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import NO_SOCKETS, can, check_interface, open_bus
+    from gz_onboard.bus._can import can, check_interface, open_bus
+    from gz_onboard.bus.socketcan import NO_SOCKETS
 
     check_interface(interface)
     buses: list[can.BusABC] = []

@@ -1,4 +1,4 @@
-"""What a simulated ride asks of the battery that none can give: a voltage at the cut-off, or charge below none."""
+"""Demands of a simulated ride on the battery that none can give: a voltage at the cut-off, or charge below none."""
 
 from __future__ import annotations
 

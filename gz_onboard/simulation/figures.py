@@ -1,4 +1,4 @@
-"""Pictures of a simulated ride: time series, where the energy went, measured beside simulated, sweeps."""
+"""Figures of a simulated ride: time series, energy flows, measurement and simulation, sweeps."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ def overview(run: Run, title: str) -> Figure:
 
 
 def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
-    """Measured beside simulated: speed, SOC, pack voltage, pack current, motor torque, throttle, temperatures.
+    """Compare measurement and simulation: speed, SOC, pack voltage, pack current, motor torque, throttle, temperatures.
 
-    measured: by the names of `run.COLUMNS`, of the length of the run's series; what is missing is not drawn.
+    measured: by the names of `run.COLUMNS`, of the length of the run's series; missing columns are not drawn.
     """
     s = run.series
     rows = [
@@ -113,9 +113,9 @@ Flow = tuple[str, float, str]
 
 
 def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -> Figure:
-    """Where the energy went: sources on the left, on the right what took it, as thick as it is much.
+    """Energy flows: sources on the left, consumers on the right, each as thick as its energy.
 
-    ledger: J by name, of `effects` and other entries; what is negative gave energy and is on the left with the cells.
+    ledger: J by name, of `effects` and other entries; negative entries gave energy and are on the left with the cells.
     """
     from matplotlib.patches import Rectangle
 
@@ -151,7 +151,7 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
 
 
 def _flows(ledger: Mapping[str, float], effects: Sequence[Effect]) -> tuple[list[Flow], list[Flow], float]:
-    """(what gave energy, what took it, the sum of the latter [J]), without what is too little to be seen."""
+    """(sources, consumers, sum of the consumers [J]), without entries too small to be seen."""
     order = []
     for colour, ports, others in STAGES.values():
         own = [effect.name for port in ports for effect in effects if effect.port is port]

@@ -1,4 +1,4 @@
-"""A simulated ride as CAN frames: each message in its period, packed as its DBC file says, with what a bus loses.
+"""A simulated ride as CAN frames: each message in its period, packed as its DBC file says, with the losses of a bus.
 
 Time comes from an argument and chance from a seed: the same ride and seed give the same bytes. Each signal, each
 message's phase and each kind of loss draws from its own stream, so losing frames changes no other frame.
@@ -18,7 +18,7 @@ from gz_onboard.bus.layout import raw_range
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.recording.export import out_suffix, write_frames_as
-from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, latency, shaken, spread
+from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, SimulatedSensor, latency, shaken, spread
 from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle
 
@@ -38,7 +38,7 @@ _PHASE, _LOSS, _GAPS = 101, 102, 103  # streams of chance that belong to no sign
 
 @dataclass(frozen=True)
 class Dropouts:
-    """What the bus and the GPS receiver do not deliver."""
+    """Frames that the bus, and fixes that the GPS receiver, do not deliver."""
 
     frames: float = 1e-4  # share of the frames of each message
     gps_gap_every: float = 600.0  # s in the mean from one gap without fix to the next; 0 is never
@@ -70,8 +70,8 @@ def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dro
 def messages_sent(vehicle: Vehicle) -> list[Message]:
     """The messages of which frames can be simulated.
 
-    InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no period or cannot
-    be packed.
+    InputError if the vehicle's DBC files have none of the sensors' signals, or a message has no period or cannot be
+    packed.
     """
     known, periods = {sensor.signal for sensor in (*SENSORS, *ROLLER)}, vehicle.mapping.periods
     messages = vehicle.mapping.database.messages
@@ -129,7 +129,7 @@ def write_frames(out: Path, sent: list[Stream]) -> int:
 
 
 def _send(
-    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, dropouts: Dropouts
+    vehicle: Vehicle, message: Message, sensors: dict[str, SimulatedSensor], truth: Truth, seed: int, dropouts: Dropouts
 ) -> Stream:
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
@@ -171,8 +171,10 @@ def _send(
     return Stream(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
 
-def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
-    """What is read at `seconds`, in the unit of the DBC; not a number where there is no such sensor."""
+def _values(
+    sensor: SimulatedSensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator
+) -> Floats:
+    """The sensor's readings at `seconds`, in the unit of the DBC; NaN without a sensor."""
     if sensor is None:
         return np.full(len(seconds), np.nan)
     steps = np.clip(((seconds - latency(sensor, truth.parameters)) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
@@ -198,7 +200,7 @@ def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floa
 
 
 def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
-    """The nearest raw values within the limits; the code for not available for what is not a number."""
+    """The nearest raw values within the limits; the code for not available in place of NaN."""
     low, high = raw_range(signal, not_available=True)
     absent = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
     scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)

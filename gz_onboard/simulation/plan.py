@@ -40,12 +40,12 @@ RANGES: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """How a cycle, a route or a recorded ride is to be ridden; what is None is as recorded, or usual.
+    """How to ride a cycle, a route or a recorded ride; None: as recorded, or usual.
 
     soc: state of charge at the start, 0 to 1. ambient: of air and vehicle at the start [degC]. grade: of the road [%,
     uphill positive]. wind: against the rider [m/s]. repeat: times that a cycle is ridden, or until_empty: until the
     pack is. dyno: ``KG[,A,B,C]``, on a chassis dynamometer. chassis: straight, planar or leaning. predictive: a
-    rider follows the speed of a recorded ride. Raises InputError for what is none of these, or out of its range.
+    rider follows the speed of a recorded ride. Raises InputError for other values, or values out of range.
     """
 
     soc: float | None = None
@@ -70,7 +70,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be ridden: commands, the road under them, and what is known of the start."""
+    """Commands of a ride, the road, and the state at the start."""
 
     name: str
     kind: str
@@ -84,7 +84,7 @@ class Plan:
 
 
 def find_plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
-    """The plan for `what`; InputError for what is neither a file that can be ridden nor a built-in cycle."""
+    """The plan for `what`: a file that can be ridden or a built-in cycle; InputError otherwise."""
     plan = _plan(what, options, vehicle)
     if options.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
         where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"
@@ -115,7 +115,7 @@ def _plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
 
 
 def vehicle_on(what: str, vehicle: str | Path, payload: float | None = None) -> tuple[Vehicle, str]:
-    """(vehicle, source of its payload): that given [kg], or of a recorded ride what ``rides.json`` beside it says."""
+    """(vehicle, source of its payload): the one given [kg], or that in the ``rides.json`` of a recorded ride."""
     source = "--payload"
     if payload is None:
         payload = rider_mass(facts_of(Path(what))) if _kind(Path(what)) == "ride" else None
@@ -201,7 +201,7 @@ def route_file(log: Path) -> Path:
 def ridden_road(
     recorded: Recorded, log: Path, headwind: float = 0.0, roller: Dynamometer | None = None
 ) -> tuple[Ground, Heading]:
-    """(what was ridden on, its heading): a roller, the road of the route file beside the log, or of the filter."""
+    """(surface of the ride, its heading): a roller, the road of the log's route file, or that of the filter."""
     if roller or recorded.on_dynamometer:
         return roller or fit_dynamometer(recorded), recorded.heading_at
     if not route_file(log).is_file():

@@ -1,8 +1,7 @@
 """Recorded rides as inputs of a simulation: throttle and brake, speed, and what to compare the simulation with.
 
-Frames go through the codec of the bus, so what it drops is dropped here too. The road that was ridden is that of the
-estimator's road filter (accelerometer, altitude, yaw rate), or that of a route file. How rough it was is what the
-estimator takes it for.
+Frames go through the codec of the bus, which drops the same ones as on board. The road is that of the estimator's road
+filter (accelerometer, altitude, yaw rate), or that of a route file. Its roughness is the estimator's.
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 class Recorded:
     """A recorded ride, at even steps.
 
-    signals: by role, in its SI unit, arrays of one length; only what was recorded, without what the vehicle's sensors
-    are known to err by (`physics.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
+    signals: by role, in its SI unit, arrays of one length; only recorded ones, corrected for known errors of the
+    vehicle's sensors (`physics.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
     of `brake_torque_limit`) and ``soc`` (counted charge) are worked out; ``vibration`` [m/s²] too, if the vehicle's
     model reads it and the ride tells it.
     """
@@ -101,7 +100,7 @@ class Recorded:
 
 
 def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Recorded:
-    """The ride in `log`, of `vehicle`. `progress` is told how many frames were read.
+    """The ride in `log`, of `vehicle`. progress: called with the number of frames read.
 
     Raises InputError for a log that cannot be read, or that has no speed.
     """
@@ -146,7 +145,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
-    """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
+    """All on one grid of steps: speeds interpolated, signals that come in steps held."""
     pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
@@ -171,7 +170,7 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
 def _over_road(distance: Array, values: Array, period: float | None = None) -> Array:
     """`values` (n,) at `distance` (n,) [m], each `ROAD_PIECE` of the way; where the scooter stood, as it came there.
 
-    period: of an angle, which then goes on over a whole turn.
+    period: of an angle, which then continues over a whole turn.
     """
     distance, keep = np.unique(distance, return_index=True)
     found = values[keep] if period is None else np.unwrap(values[keep], period=period)
@@ -190,7 +189,7 @@ def scooter_at_start(
     ambient: float | None = None,
     **options: Any,
 ) -> Scooter:
-    """The scooter as it was when a recorded ride began; what was not measured, and all without a ride, is at `ambient`.
+    """The scooter as it was when a recorded ride began; parts without a measurement are at `ambient`.
 
     ambient: air [degC]; None: as measured, or 20 degC. options: of `Scooter`.
     """

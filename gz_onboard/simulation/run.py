@@ -1,6 +1,6 @@
 """Rides of the simulated scooter: along a cycle, along a route, or with throttle and brake given.
 
-`drive` is the loop; a `Command` says what the rider does in each step. Nothing here reads files or prints.
+`drive` is the loop; a `Command` gives the rider's throttle and brake in each step. Nothing here reads files or prints.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Shortfall:
 
 @dataclass
 class Run:
-    """What came out of a ride. Energies in J."""
+    """Result of a ride. Energies in J."""
 
     series: dict[str, Array]  # by the names of `COLUMNS`, of one length
     ledger: dict[str, float]  # every loss by name, and kinetic and potential energy gained; its sum is `chemical`
@@ -107,7 +107,7 @@ class Run:
 
     @property
     def closure(self) -> float:
-        """What the ledger misses of the energy out of the cells, as a share of all that was turned over."""
+        """Energy out of the cells that the ledger misses, as a share of all energy turned over."""
         turnover = sum(abs(energy) for energy in self.ledger.values())
         return (self.chemical - sum(self.ledger.values())) / turnover if turnover else 0.0
 
@@ -219,12 +219,13 @@ def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
 
 
 def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Command:
-    """A rider who follows `speeds` [m/s], one for each step of `dt` [s]; after the last it begins anew."""
+    """A rider who follows `speeds` [m/s], one for each step of `dt` [s]; after the last it starts again."""
     rider, count = rider or Rider(), len(speeds)
 
     def command(scooter: Scooter) -> tuple[float, float, float]:
         wanted = speeds[round(scooter.time / dt) % count]
-        return *rider.step(wanted, scooter.speed, dt), wanted
+        throttle, brake = rider.step(wanted, scooter.speed, dt)
+        return throttle, brake, wanted
 
     return command
 
@@ -247,7 +248,8 @@ def along(metres: Sequence[float]) -> Command:
     def command(scooter: Scooter) -> tuple[float, float, float]:
         ahead = scooter.distance + 0.5 * scooter.speed
         wanted = max(metres[min(max(int(ahead), 0), last)], 1.0)
-        return *rider.step(wanted, scooter.speed, scooter.dt), wanted
+        throttle, brake = rider.step(wanted, scooter.speed, scooter.dt)
+        return throttle, brake, wanted
 
     return command
 
@@ -311,7 +313,7 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
 
 
 def energy_left(vehicle: Vehicle, soc: float, temperature: float, power: float, form_factor_squared: float) -> float:
-    """What the pack still delivers [J] down to the cut-off voltage, at `soc` and `temperature` [degC].
+    """Energy [J] that the pack still delivers down to the cut-off voltage, at `soc` and `temperature` [degC].
 
     power: the mean [W], above 0; form_factor_squared: of the current, as of a `Run`.
     """
@@ -322,9 +324,9 @@ def energy_left(vehicle: Vehicle, soc: float, temperature: float, power: float, 
 def range_by_energy(scooter: Scooter, run: Run) -> float | None:
     """How far [m] the pack goes from the start of `run` at its consumption; None if that is not known.
 
-    What was ridden, and what the energy left at the end is good for, at the run's mean power and form factor of the
-    current. So it is never less than what was ridden. Asked at the start, the same equation would take the cells for
-    as warm as in the mean, and the voltage that they lose for settled from the first metre on.
+    The distance ridden, and the distance that the energy left at the end allows, at the run's mean power and form
+    factor of the current. So it is never less than the distance ridden. At the start, the same equation would take the
+    mean temperature of the cells, and their voltage losses as settled, from the first metre.
     """
     consumption = run.consumption
     if consumption is None or consumption <= 0:

@@ -10,22 +10,21 @@ ledger closes to rounding.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from math import sqrt
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
-from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.elementary import direction
-from gz_onboard.physics.model import Bound, air_density, drag_torque, remembering
-from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
+from gz_onboard.physics.functions import direction
+from gz_onboard.physics.model import air_density, drag_torque, stepper
+from gz_onboard.simulation.parts.battery import FirstOrderPack, PackModel
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.simulation.parts.controller import Controller
-from gz_onboard.simulation.parts.driveline import Acting, Driveline
-from gz_onboard.simulation.parts.motor import Call, EffectMotor, Losses, Motor
+from gz_onboard.simulation.parts.driveline import Driveline
+from gz_onboard.simulation.parts.motor import EffectMotor, Losses, Motor
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.parts.tyre import Tyre
 from gz_onboard.vehicle import Vehicle
@@ -33,13 +32,14 @@ from gz_onboard.vehicle import Vehicle
 STEP = 0.01  # s
 WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
 """What a force may read to act on a dynamometer too: it is at the wheel, not of air, hill or bend."""
-TRACKED = frozenset({"heading", "time_moving", "soc", "cell_temperature", "cell_current", "vibration"})
+SURROUNDINGS = frozenset({"heading", "time_moving", "vibration"})
+CELLS = frozenset({"soc", "cell_temperature", "cell_current"})
 LEAST_LOAD = 0.05  # of the weight, on the rear axle
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
 
 class Options(TypedDict, total=False):
-    """How a simulation begins, and the parts that stand in for the vehicle's own."""
+    """Start of a simulation, and parts that replace the vehicle's own."""
 
     soc: float  # 1 if not given
     ambient: float  # degC; 20
@@ -49,7 +49,7 @@ class Options(TypedDict, total=False):
     dt: float  # s; STEP
     heading: float | Callable[[float], float]  # rad clockwise from north: where the road begins, or over distance [m]
     vibration: float | Callable[[float], float] | None  # m/s²: how rough the road is, or over distance [m]
-    pack: Pack | None
+    pack: PackModel | None
     motor: Motor | None
     chassis: Chassis | None
     tyre_form: str  # transient; or steady, as the thesis prints it, see `Tyre`
@@ -59,10 +59,10 @@ class Options(TypedDict, total=False):
 class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
-    `pack`, `motor`, `chassis` may be replaced by any object with the methods of `Pack`, `Motor`, `Chassis`; a chassis
-    that turns is refused (InputError) beside an effect that is the same loss. The other parts are attributes, to be
-    set before the first step; effects of the model in the cells act in the own pack only. Without `vibration` a road
-    is as rough as the vehicle's file expects, and a roller smooth. `heading` by a number turns with the road.
+    `pack`, `motor`, `chassis` may be any objects with the methods of `PackModel`, `Motor`, `Chassis`. A chassis that
+    turns is refused (InputError) together with an effect that is the same loss. Effects of the model in the cells act
+    in `FirstOrderPack` only. Without `vibration` a road is as rough as the vehicle's file expects, and a roller smooth.
+    `heading` by a number turns with the road.
     """
 
     def __init__(
@@ -101,7 +101,8 @@ class Scooter:
         self._rough = 0.0 if callable(rough) else rough
         self.vibration = 0.0  # m/s², of a vehicle whose effects read it
         model = self.vehicle.model
-        self._tracks = bool(model.reads & TRACKED)
+        outside = [effect.reads for effect in model.effects if effect.port is not Port.CELL_VOLTAGE]
+        self._tracks = bool(model.reads & SURROUNDINGS or CELLS & frozenset().union(*outside))
         self._q |= {
             "mass": model.mass,
             "air_density": air_density(self.ambient, options.get("altitude", 0.0)),
@@ -111,30 +112,28 @@ class Scooter:
             "heading": self.heading,
         }
 
-    def _build_electric(self, options: Options, cells: float) -> None:
-        """Pack, motor, inverter and what cools them; cells: their temperature [degC]."""
+    def _build_electric(self, options: Options, celsius: float) -> None:
+        """Pack, motor, inverter and what cools them; celsius: the cells' temperature."""
         vehicle, p, dt = self.vehicle, self.vehicle.parameters, self.dt
         model, battery, soc = vehicle.model, vehicle.pack, options.get("soc", 1.0)
-        self.voltage = battery.cells_series * battery.ocv(soc, cells)[0]
+        self.voltage = battery.cells_series * battery.ocv(soc, celsius)[0]
         self.sensed_voltage = self.voltage  # V, as the controller has it
         self._series = battery.cells_series
         self._voltage_gain = min(dt / VOLTAGE_FILTER, 1.0)
-        self._q["cell_capacity"] = battery.cell_capacity(cells)
-        inside = CellEffects(model, battery)
-        own = EffectPack(battery, soc, inside, self._q) if inside else FirstOrderPack(battery, soc)
-        self.pack: Pack = options.get("pack") or own
-        self._inverter = Losses(_calls(model.at(Port.INVERTER_LOSS), dt), dt)
-        self._dc = Losses(_calls(model.at(Port.DC_POWER), dt), dt)
-        losses = model.at(Port.MOTOR_LOSS)
+        self._q["cell_capacity"] = battery.cell_capacity(celsius)
+        cells = model.at(Port.CELL_VOLTAGE)
+        inside = stepper(cells, dt) if cells else None
+        self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
+        self._inverter = Losses(model.at(Port.INVERTER_LOSS), dt)
+        self._dc = Losses(model.at(Port.DC_POWER), dt)
         constants = p["torque_constant"], p["voltage_constant"]
-        effects = EffectMotor(Losses(_calls(losses, dt), dt), losses, *constants, self._q)
-        self.motor: Motor = options.get("motor") or effects
+        self.motor: Motor = options.get("motor") or EffectMotor(model.at(Port.MOTOR_LOSS), dt, *constants, self._q)
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
-        self.inverter_cooling = InverterCooling.of(p, self.ambient)
-        self.motor_cooling = MotorCooling.of(p, self.ambient)
-        self.pack_cooling = LumpedCooling.of(p, "pack", cells)
-        self.bms_cooling = LumpedCooling.of(p, "bms", cells)
+        self.inverter_cooling = InverterCooling(p, self.ambient, self.ambient)
+        self.motor_cooling = MotorCooling(p, self.ambient, self.ambient)
+        self.pack_cooling = LumpedCooling(p, "pack", celsius)
+        self.bms_cooling = LumpedCooling(p, "bms", celsius)
         self._cooling_factor = p["cooling_factor"]
         self._bms_resistance = min(p["bms_resistance"], battery.series_resistance)  # its part of it
         # J in the current cooling period; idle: the motor's part that comes without current
@@ -152,15 +151,20 @@ class Scooter:
                     f"model.effects lists {effect.name}, and the {self.chassis.name} chassis has the same loss: "
                     "it would count twice; take one of them"
                 )
-        self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=options.get("tyre_form", "transient"))
+        tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=options.get("tyre_form", "transient"))
         disc = p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"]
-        self.brakes = Brakes(*disc, p["front_brake_share"], options.get("brake_form", "friction"))
+        brakes = Brakes(*disc, p["front_brake_share"], options.get("brake_form", "friction"))
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
-        forces = [e for e in model.at(Port.WHEEL_FORCE) if "acceleration" not in e.effect.quantities]
+        forces = [e for e in model.at(Port.WHEEL_FORCE) if "acceleration" not in e.effect.reads]
         if roller:
             forces = [e for e in forces if e.effect.reads <= WHEEL_ONLY]
-        self._forces, self._rolling = _calls(forces, self.dt), _calls(model.at(Port.TYRE), self.dt)
-        self._stores = {e.effect.name for e in forces if e.effect.stores_energy}
+        rolling = model.at(Port.TYRE)
+        # The energy of effects that store it is booked as kinetic and potential energy.
+        self._force_names, self._rolling_names = (
+            [(i, x.effect.name) for i, x in enumerate(effects) if not x.effect.stores_energy]
+            for effects in (forces, rolling)
+        )
+        self._forces, self._rolling = stepper(forces, self.dt), stepper(rolling, self.dt)
         self._radius, self._gear, self._gear_efficiency = p["wheel_radius"], p["gear_ratio"], p["gear_efficiency"]
         self._weight = model.mass * GRAVITY
         self._turns = self.chassis.name != "straight" and not roller
@@ -169,7 +173,7 @@ class Scooter:
         self._lever = p["cg_height"] / p["wheelbase"]
         rolls = p["wheel_inertia_front"] / self._radius**2  # the front wheel rolls without slip
         mass = roller.inertia if roller else model.mass + rolls
-        self._driveline = Driveline(mass, p["wheel_inertia_rear"], roller is None)
+        self.driveline = Driveline(tyre, brakes, mass, p["wheel_inertia_rear"], roller is None)
 
     @property
     def lean(self) -> float:
@@ -178,7 +182,7 @@ class Scooter:
 
     def kinetic_energy(self) -> float:
         """Of vehicle and wheels [J]."""
-        return self._driveline.kinetic_energy(self.speed, self.wheel_speed)
+        return self.driveline.kinetic_energy(self.speed, self.wheel_speed)
 
     def potential_energy(self) -> float:
         """Over the start [J]."""
@@ -198,16 +202,16 @@ class Scooter:
         idle = self.motor.idle(w / gear, self.motor_cooling.stator)
         torque = self.motor.torque_constant * current - drag_torque(idle, w / gear)
         drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
-        forces = [term(q) for _, term in self._forces]
-        rolling = [term(q) for _, term in self._rolling]
+        forces, rolling = self._forces(q), self._rolling(q)
         share = self.rear_load / normal
         front_share = 0.0 if roller else 1 - share
         total = sum(rolling)
         absorbed = roller.absorbed(v) if roller else 0.0
         against = sum(forces) + front_share * total + turning + absorbed
 
-        acting = Acting(drive, against, share * total, self.rear_load, radius)
-        dv, dw, force, braking, front_braking = self._driveline.step(self.tyre, self.brakes, acting, v, w, brake, dt)
+        dv, dw, force, braking, front_braking = self.driveline.step(
+            v, w, drive, against, share * total, self.rear_load, radius, brake, dt
+        )
         v_mean, w_mean = v + dv / 2, w + dw / 2
         self.speed, self.wheel_speed, self.force = v + dv, w + dw, force
         self.distance += v_mean * dt
@@ -215,16 +219,16 @@ class Scooter:
         self.time += dt
 
         # --- every watt at the wheels
-        for (name, _), newton in zip(self._forces, forces, strict=True):
-            if name not in self._stores:  # what stores energy is in the kinetic and potential energy
-                entries[name] += newton * v_mean * dt
+        way = v_mean * dt
+        for i, name in self._force_names:
+            entries[name] += forces[i] * way
         if turning:
             entries["turning"] += turning * v_mean * dt
         if roller:
             entries["dynamometer"] += absorbed * v_mean * dt
-        turned = share * radius * w_mean + front_share * v_mean
-        for (name, _), newton in zip(self._rolling, rolling, strict=True):
-            entries[name] += newton * turned * dt
+        turned = (share * radius * w_mean + front_share * v_mean) * dt
+        for i, name in self._rolling_names:
+            entries[name] += rolling[i] * turned
         entries["tyre_slip"] += force * (radius * w_mean - v_mean) * dt
         entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
         mechanical = torque * w_mean / gear
@@ -251,16 +255,16 @@ class Scooter:
         else:
             shift = self.force * self._lever
         rear = normal * self._rear_share + shift
-        self.rear_load = min(max(rear, LEAST_LOAD * normal), normal)
-        self.front_load = normal - self.rear_load
+        least = LEAST_LOAD * normal
+        self.rear_load = rear = least if rear < least else normal if rear > normal else rear
+        self.front_load = normal - rear
         return normal, turning, radius
 
     def _draw(self, mechanical: float, motor_speed: float, current: float) -> None:
         """Every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19), and its heat."""
         dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
-        q["torque"] = self.motor.torque_constant * current
+        q["motor_speed"], q["motor_current"], q["torque"] = motor_speed, current, self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
-        q["motor_speed"], q["motor_current"] = motor_speed, current
         inverter_heat = self._inverter.total(q, entries)
         power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries)
         self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
@@ -314,7 +318,3 @@ class Scooter:
     def _watch(self) -> None:
         motor, inverter = self.motor_cooling.stator, self.inverter_cooling.board
         self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)
-
-
-def _calls(effects: Iterable[Bound], dt: float) -> list[Call]:
-    return [(effect.effect.name, remembering(effect, dt)) for effect in effects]

@@ -1,7 +1,7 @@
-"""What the reference scooter's sensors make of a simulated ride: values with gain, offset, noise and delay.
+"""Readings of the reference scooter's sensors in a simulated ride: with gain, offset, noise and delay.
 
-`trace` keeps the scooter's states; `SENSORS` says for each signal of the scooter's DBC files what of
-it is sensed and how well. Figures are those of docs/reference-scooter.md; where that has none, a guess of this file.
+`trace` keeps the scooter's states; `SENSORS` gives the sensor of each signal of the scooter's DBC files.
+Figures are those of docs/reference-scooter.md, or guesses where that has none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.vibration import FAST
+from gz_onboard.physics.sensors import VIBRATION_PERIOD_S
 from gz_onboard.simulation.trace import Truth
 
 BAR = 1e5  # Pa
@@ -27,7 +27,7 @@ _METRES_PER_DEGREE = 111_200.0
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SimulatedSensor:
     """One signal: the true value in the unit of the DBC, as read `delay` [s] later with noise of `sd` in that unit.
 
     noise_time: time constant [s] of the noise; 0 is white. Quantisation is that of the DBC.
@@ -44,7 +44,7 @@ def _column(name: str, factor: float = 1.0) -> Callable[[Truth], Array]:
     return lambda t: factor * t[name]
 
 
-def _temperatures() -> list[Sensor]:
+def _temperatures() -> list[SimulatedSensor]:
     places = {
         "INV_Temperature": "inverter",
         "INV_MotorTemperature": "motor",
@@ -54,8 +54,10 @@ def _temperatures() -> list[Sensor]:
     }
     places |= {f"BMS_CellTemp{which}": "cell" for which in ("Min", "Max", "Mean")} | {"BMS_BoardTemp": "bms"}
     places |= {f"TC_Pack{i}": "cell" for i in range(1, 7)}
-    sensors = [Sensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
-    return sensors + [Sensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")]
+    sensors = [SimulatedSensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
+    return sensors + [
+        SimulatedSensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")
+    ]
 
 
 def _delay(signal: str) -> float:
@@ -128,82 +130,86 @@ def _front_wheel(t: Truth) -> Array:
 
 
 _RPM = 60 / (2 * pi)
-SENSORS: tuple[Sensor, ...] = (
+SENSORS: tuple[SimulatedSensor, ...] = (
     # inverter
-    Sensor("INV_MotorSpeed", _motor_speed, sd=0.3),
-    Sensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
-    Sensor("INV_MotorTorque", _column("motor_current", REPORTED_TORQUE), sd=0.1),
-    Sensor("INV_State", _inverter_state),
-    Sensor("INV_DcVoltage", _inverter_voltage, sd=0.042),
-    Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
+    SimulatedSensor("INV_MotorSpeed", _motor_speed, sd=0.3),
+    SimulatedSensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
+    SimulatedSensor("INV_MotorTorque", _column("motor_current", REPORTED_TORQUE), sd=0.1),
+    SimulatedSensor("INV_State", _inverter_state),
+    SimulatedSensor("INV_DcVoltage", _inverter_voltage, sd=0.042),
+    SimulatedSensor("INV_DcCurrent", _inverter_current, sd=0.35),
     # battery; gain, offset and noise are the vehicle's, see `spread`
-    Sensor("BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY),
-    Sensor(
+    SimulatedSensor(
+        "BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY
+    ),
+    SimulatedSensor(
         "BMS_PackCurrent",
         lambda t: t["pack_current"] * t.parameters["pack_current_gain"] + t.parameters["pack_current_offset"],
         delay=BMS_DELAY,
     ),
-    Sensor("BMS_StateOfCharge", _column("soc", 100.0), delay=BMS_DELAY),
-    Sensor("BMS_State", lambda t: t.constant(2.0)),
-    Sensor("BMS_Contactor", lambda t: t.constant(1.0)),
+    SimulatedSensor("BMS_StateOfCharge", _column("soc", 100.0), delay=BMS_DELAY),
+    SimulatedSensor("BMS_State", lambda t: t.constant(2.0)),
+    SimulatedSensor("BMS_Contactor", lambda t: t.constant(1.0)),
     # rider
-    Sensor("VCU_Throttle", _column("throttle", 100.0)),
-    Sensor("VCU_BrakeSwitch", lambda t: (t["brake"] > 0.0).astype(float)),
-    Sensor("VCU_RideMode", lambda t: t.constant(1.0)),
-    Sensor("VCU_SideStand", lambda t: t.constant(0.0)),
-    Sensor("VCU_ChargePlug", lambda t: t.constant(0.0)),
-    Sensor("VCU_HeadLamp", lambda t: t.constant(1.0)),
-    Sensor("VCU_Odometer", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
-    Sensor("VCU_Trip", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
+    SimulatedSensor("VCU_Throttle", _column("throttle", 100.0)),
+    SimulatedSensor("VCU_BrakeSwitch", lambda t: (t["brake"] > 0.0).astype(float)),
+    SimulatedSensor("VCU_RideMode", lambda t: t.constant(1.0)),
+    SimulatedSensor("VCU_SideStand", lambda t: t.constant(0.0)),
+    SimulatedSensor("VCU_ChargePlug", lambda t: t.constant(0.0)),
+    SimulatedSensor("VCU_HeadLamp", lambda t: t.constant(1.0)),
+    SimulatedSensor("VCU_Odometer", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
+    SimulatedSensor("VCU_Trip", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
     # measuring system
-    Sensor("IMU_AccelX", _forward, sd=0.05),
-    Sensor("IMU_AccelY", _lateral, sd=0.05),
-    Sensor("IMU_AccelZ", _vertical, sd=0.05),
-    Sensor("IMU_RateX", _column("lean_rate", 180 / pi), sd=0.1),
-    Sensor("IMU_RateY", _pitch, sd=0.1),
-    Sensor("IMU_RateZ", _yaw, sd=0.1),
-    Sensor("HBM_WheelSpeedFront", _front_wheel, sd=0.002),
-    Sensor("HBM_WheelSpeedRear", _column("wheel_speed", 1 / (2 * pi)), sd=0.002),
-    Sensor("HBM_BrakePressureFront", _pressure(lambda p: p["front_brake_share"]), sd=0.05),
-    Sensor("HBM_BrakePressureRear", _pressure(lambda p: 1 - p["front_brake_share"]), sd=0.05),
-    Sensor("HBM_AuxCurrent", _column("auxiliary_current"), sd=0.01),
-    Sensor("GPS_Latitude", lambda t: LATITUDE + t["north"] / _METRES_PER_DEGREE, 1e-5, GPS_DELAY, 30.0),
-    Sensor("GPS_Longitude", _longitude, 1.4e-5, GPS_DELAY, 30.0),
-    Sensor("GPS_Speed", _column("way"), 0.1, GPS_DELAY),
-    Sensor("GPS_Course", _course, 1.0, GPS_DELAY),
-    Sensor("GPS_Altitude", lambda t: ALTITUDE + t["climb"], 1.5, GPS_DELAY, 30.0),
-    Sensor("GPS_Satellites", lambda t: t.constant(9.0)),
-    Sensor("GPS_Fix", lambda t: t.constant(3.0)),
+    SimulatedSensor("IMU_AccelX", _forward, sd=0.05),
+    SimulatedSensor("IMU_AccelY", _lateral, sd=0.05),
+    SimulatedSensor("IMU_AccelZ", _vertical, sd=0.05),
+    SimulatedSensor("IMU_RateX", _column("lean_rate", 180 / pi), sd=0.1),
+    SimulatedSensor("IMU_RateY", _pitch, sd=0.1),
+    SimulatedSensor("IMU_RateZ", _yaw, sd=0.1),
+    SimulatedSensor("HBM_WheelSpeedFront", _front_wheel, sd=0.002),
+    SimulatedSensor("HBM_WheelSpeedRear", _column("wheel_speed", 1 / (2 * pi)), sd=0.002),
+    SimulatedSensor("HBM_BrakePressureFront", _pressure(lambda p: p["front_brake_share"]), sd=0.05),
+    SimulatedSensor("HBM_BrakePressureRear", _pressure(lambda p: 1 - p["front_brake_share"]), sd=0.05),
+    SimulatedSensor("HBM_AuxCurrent", _column("auxiliary_current"), sd=0.01),
+    SimulatedSensor("GPS_Latitude", lambda t: LATITUDE + t["north"] / _METRES_PER_DEGREE, 1e-5, GPS_DELAY, 30.0),
+    SimulatedSensor("GPS_Longitude", _longitude, 1.4e-5, GPS_DELAY, 30.0),
+    SimulatedSensor("GPS_Speed", _column("way"), 0.1, GPS_DELAY),
+    SimulatedSensor("GPS_Course", _course, 1.0, GPS_DELAY),
+    SimulatedSensor("GPS_Altitude", lambda t: ALTITUDE + t["climb"], 1.5, GPS_DELAY, 30.0),
+    SimulatedSensor("GPS_Satellites", lambda t: t.constant(9.0)),
+    SimulatedSensor("GPS_Fix", lambda t: t.constant(3.0)),
     *_temperatures(),
 )
 """Cell voltages, limits, steering and suspension are in the DBC files but not here: the simulation has none."""
 
-ROLLER: tuple[Sensor, ...] = (
-    Sensor("DYNO_RollerSpeed", _column("speed"), sd=0.002),
-    Sensor("DYNO_RollerForce", _column("tyre_force"), sd=1.0),
+ROLLER: tuple[SimulatedSensor, ...] = (
+    SimulatedSensor("DYNO_RollerSpeed", _column("speed"), sd=0.002),
+    SimulatedSensor("DYNO_RollerForce", _column("tyre_force"), sd=1.0),
 )
 """On the chassis dynamometer only."""
 
 
-def shaken(sensor: Sensor, truth: Truth, period: float) -> Array | None:
-    """The standard deviation of what the road shakes into the sensor [its unit] at each step; None if it does not.
+def shaken(sensor: SimulatedSensor, truth: Truth, period: float) -> Array | None:
+    """Standard deviation of the vibration of the road at the sensor [its unit] at each step; None without any.
 
-    White, sampled each `period` [s], of the size that `physics.vibration.Vibration` makes the truth's vibration of.
+    White, sampled each `period` [s], of the size that `physics.sensors.Vibration` makes the truth's vibration of.
     """
     if sensor.signal != "IMU_AccelZ" or not truth["vibration"].any():
         return None
-    keep = np.exp(-period / FAST)  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
+    keep = np.exp(
+        -period / VIBRATION_PERIOD_S
+    )  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
     shown: Array = truth["vibration"] / (keep * np.sqrt(2 / (1 + keep)))
     return shown
 
 
-def spread(sensor: Sensor, parameters: Mapping[str, float]) -> float:
+def spread(sensor: SimulatedSensor, parameters: Mapping[str, float]) -> float:
     """The standard deviation of the sensor's noise, in the unit of its signal; of the pack's that of the vehicle."""
     name = {"BMS_PackVoltage": "pack_voltage_noise", "BMS_PackCurrent": "pack_current_noise"}.get(sensor.signal)
     return parameters[name] if name else sensor.sd
 
 
-def latency(sensor: Sensor, parameters: Mapping[str, float]) -> float:
+def latency(sensor: SimulatedSensor, parameters: Mapping[str, float]) -> float:
     """How late the sensor is [s]: the pack's voltage as much later than its current as the vehicle's file says."""
     return sensor.delay + (parameters["pack_voltage_latency"] if sensor.signal == "BMS_PackVoltage" else 0.0)
 

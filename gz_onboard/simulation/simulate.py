@@ -166,7 +166,7 @@ def _expected_seconds(options: SimulationOptions, plan: Plan, sweeps: Sequence[S
 def variant(
     vehicle: Vehicle, values: dict[str, float], plan: Plan, options: SimulationOptions, progress: Progress | None
 ) -> Variant:
-    """What the ride is with other `values` of the swept parameters."""
+    """The ride with other `values` of the swept parameters."""
     result, scooter = ride(redesigned(vehicle, values), plan, options, progress)
     metres, _ = cycle_range(result, scooter)
     shortfall = sum(s.duration for s in result.shortfalls)

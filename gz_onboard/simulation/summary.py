@@ -1,4 +1,4 @@
-"""What a simulated ride came to: the summary of ``gz-onboard simulate``, as JSON and as text."""
+"""Summary of ``gz-onboard simulate``, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ShortfallEntry:
 
 @dataclass(frozen=True)
 class BeyondEntry:
-    """What the ride asked of the battery that it cannot give."""
+    """Demand of the ride that the battery cannot meet."""
 
     charge: bool
     time_s: float
@@ -60,7 +60,7 @@ class BeyondEntry:
 
 @dataclass(frozen=True)
 class MeasuredEntry:
-    """What was measured on a recorded ride, and the RMS of simulated less measured."""
+    """Measurement of a recorded ride, and the RMS of simulated less measured."""
 
     distance_km: float
     energy_wh: float | None
@@ -156,7 +156,7 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
 
 
 def by_energy(result: Run, scooter: Scooter) -> float | None:
-    """What was ridden, and the energy left over the consumption [m]; None of a ride that went on without charge."""
+    """Distance ridden and energy left over the consumption [m]; None of a ride that continued without charge."""
     if result.beyond and result.beyond[-1].charge and not result.empty:
         return None
     return range_by_energy(scooter, result)
@@ -202,7 +202,7 @@ def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Sco
 
 
 def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
-    """What was recorded of the columns of a run, at the times of its series."""
+    """The recorded columns of a run, at the times of its series."""
     at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
     return {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
 
@@ -272,7 +272,7 @@ def _repeated(summary: SimulationSummary) -> str:
 
 
 def _beyond_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
-    """What the battery cannot give, and why two ranges differ."""
+    """Demands beyond the battery, and why two ranges differ."""
     rows = []
     for b in summary.beyond_battery:
         place = f"{b.time_s:.0f} s, {b.distance_km:.2f} km"

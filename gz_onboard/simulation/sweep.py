@@ -1,4 +1,4 @@
-"""Design parameters swept: the same ride with other values, and what it takes and how far it goes."""
+"""Sweeps of design parameters: consumption and range of the same ride with other values."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     """``NAME=LO..HI[:STEPS]``: a parameter of `vehicle` by name, or a number of cells.
 
     Without STEPS five values; of cells every number, up to nine. InputError for an unknown name (with the nearest),
-    a value out of the parameter's bounds (with its unit), and what is not of that form.
+    a value out of the parameter's bounds (with its unit), and any other form.
     """
     name, _, rest = text.partition("=")
     span, _, steps = rest.partition(":")

@@ -97,7 +97,7 @@ class Truth:
         c["auxiliary_current"] = c["auxiliary_power"] / c["pack_voltage"]
 
     def _auxiliary(self, scooter: Scooter) -> Array:
-        """What all effects at the DC link draw beside the inverter [W]."""
+        """Power of all effects at the DC link except the inverter [W]."""
         c = self.columns
         q = all_quantities(
             speed=c["way"],

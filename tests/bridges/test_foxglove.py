@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import struct
 import threading
@@ -58,8 +59,9 @@ def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Ite
     stop = threading.Event()
 
     @contextmanager
-    def stopped() -> Iterator[Any]:
-        yield stop.is_set
+    def stopped(duration: float | None = None) -> Iterator[Any]:
+        end = time.monotonic() + (duration or math.inf)
+        yield lambda: stop.is_set() or time.monotonic() >= end
 
     monkeypatch.setattr(command, "until_signalled", stopped)
     monkeypatch.setattr(command, "_say", said.append)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -41,8 +43,9 @@ def bridge(port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPat
     stop = threading.Event()
 
     @contextmanager
-    def stopped() -> Iterator[Any]:
-        yield stop.is_set
+    def stopped(duration: float | None = None) -> Iterator[Any]:
+        end = time.monotonic() + (duration or math.inf)
+        yield lambda: stop.is_set() or time.monotonic() >= end
 
     monkeypatch.setattr(bridge_command, "until_signalled", stopped)
     monkeypatch.setattr(bridge_command, "_say", said.append)
@@ -147,7 +150,7 @@ def test_of_a_bridge_that_is_killed_no_number_is_left(tmp_path):
 
 def test_a_broker_that_is_not_there_and_goes_away(tmp_path, monkeypatch):
     port = free_port()
-    monkeypatch.setattr("gz_onboard.bridges.broker.RETRY", (1, 2))
+    monkeypatch.setattr("gz_onboard.bridges.broker.RETRY_S", (1, 2))
     there = f"connected to the broker 127.0.0.1:{port}"
     with bridge(port, "m2", monkeypatch=monkeypatch) as said, sending("m2"):
         wait_for(lambda: bool(said), "that it is away is said")
@@ -166,8 +169,8 @@ def test_a_broker_that_is_not_there_and_goes_away(tmp_path, monkeypatch):
 
 def test_the_state_does_not_outlive_who_says_it(tmp_path, monkeypatch):
     """A last will is lost with a broker that loses power; what it kept until then must end by itself."""
-    monkeypatch.setattr(home_assistant, "EXPIRES", 2)
-    monkeypatch.setattr(bridge_command, "AT_LEAST", 1000.0)
+    monkeypatch.setattr(home_assistant, "EXPIRES_S", 2)
+    monkeypatch.setattr(bridge_command, "AT_LEAST_S", 1000.0)
     port = free_port()
     with broker(tmp_path, port), bridge(port, "m3", monkeypatch=monkeypatch):
         with listening(port) as listener:

@@ -8,8 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from gz_onboard.dashboard.server import Feed
-from gz_onboard.dashboard.web import served
+from gz_onboard.dashboard.server import Feed, served
 from gz_onboard.events import Estimate, Reason, State
 from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
 from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames

@@ -46,7 +46,7 @@ listening() { [ "$(main_pid)" != 0 ] && systemctl --quiet is-active "$unit"; }
 tells_range() { systemctl show --property=StatusText --value "$unit" | grep -q ' km'; }
 saved() { [ -n "$(ls /var/lib/gz-onboard)" ]; }
 page_answers() { python3.11 -c 'import urllib.request as u; u.urlopen("http://127.0.0.1:8000/", timeout=20).read()'; }
-goes_on() { journalctl --no-pager -u "$unit" "_PID=$(main_pid)" | grep -q 'going on from the state saved'; }
+goes_on() { journalctl --no-pager -u "$unit" "_PID=$(main_pid)" | grep -q 'continuing from the state saved'; }
 is_new() { listening && [ "$(main_pid)" != "$old" ]; }
 
 step "the root is a clean one"

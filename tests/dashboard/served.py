@@ -14,11 +14,10 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.pictures import clock
-from gz_onboard.dashboard.server import Feed
+from gz_onboard.dashboard.pictures import clock, pictures
+from gz_onboard.dashboard.server import Feed, served
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.dashboard.view import TREND_STEP, View
-from gz_onboard.dashboard.web import feed_from, served
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, send
@@ -39,8 +38,13 @@ def dashboard(
             view.take(frame, start + TREND_STEP * i)
     bus = CanChannel("virtual", channel, identifiers=view.identifiers)
     bus.open()
+
+    def publish() -> None:
+        for new in pictures(view, bus, stop.is_set):
+            feed.publish(new.encoded())
+
     with served(feed, listen) as address:
-        loop = threading.Thread(target=feed_from, args=(view, bus, feed, stop.is_set))
+        loop = threading.Thread(target=publish)
         loop.start()
         try:
             yield address

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.bus.publisher import Publisher, sensor_signal
-from gz_onboard.dashboard.picture import ALERTS, NO_LONGER_EMPTY, Picture, picture
+from gz_onboard.dashboard.picture import ALERTS, NEARLY_EMPTY, NO_LONGER_EMPTY, Picture, picture
 from gz_onboard.dashboard.server import STATIC
 from gz_onboard.dashboard.vehicle_frames import CELLS, ODOMETER
-from gz_onboard.dashboard.view import NEARLY_EMPTY, View
+from gz_onboard.dashboard.view import View
 from gz_onboard.events import KEEPING, NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, second, seen
 
@@ -29,6 +29,9 @@ CHARGING = replace(
 )
 
 
+UNAGED = "age_s", "counts", "vehicle_counts", "version"
+
+
 def of(estimate: Estimate, now: float = 100.0) -> Picture:
     return picture(seen(estimate), now, SOURCE, up=True)
 
@@ -36,7 +39,12 @@ def of(estimate: Estimate, now: float = 100.0) -> Picture:
 def numbers(data: object) -> list[float]:
     """Every number in the JSON, but for the age, the counts and the version."""
     if isinstance(data, dict):
-        return [n for key, value in data.items() if key not in ("age_s", "counts", "version") for n in numbers(value)]
+        return [
+            n
+            for key, value in data.items()
+            if key not in ("age_s", "counts", "vehicle_counts", "version")
+            for n in numbers(value)
+        ]
     if isinstance(data, list):
         return [n for value in data for n in numbers(value)]
     return [data] if isinstance(data, int | float) and not isinstance(data, bool) else []
@@ -73,6 +81,7 @@ def test_every_number_of_the_frames():
         "alerts": [],
         "age_s": 0.0,
         "counts": {"received": 17, "lost": 0, "bad": 0},
+        "vehicle_counts": {"dropped": 7.0, "implausible": 3.0, "lost": 24.0, "unknown": 2.0},
     }
 
 

@@ -13,13 +13,14 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.command import range_view, view_of
+from gz_onboard.dashboard.command import view_of
 from gz_onboard.dashboard.picture import Picture, picture
-from gz_onboard.dashboard.vehicle_frames import RIDING, VehicleFrames, cell_limits
+from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import View
 from gz_onboard.estimator.signals import ACCEPTED_AFTER
 from gz_onboard.events import Activity, Estimate
-from gz_onboard.physics.derating import Derating, DeratingCurve
+from gz_onboard.physics.derating import Derating
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.served import PACK, Own, cells, odometer, own_frame
 from tests.dashboard.test_picture import HEALTHY, SOURCE
@@ -108,11 +109,11 @@ def test_a_cell_that_is_too_hot_or_too_cold_is_an_alert(activity, own, before, a
 
 def test_limits_are_those_of_the_controller():
     assert cell_limits(REFERENCE.derating) == (-5.0, 50.0)
-    assert cell_limits(Derating()) == RIDING
-    hot = DeratingCurve((0.0, 55.0, 60.0), (1.0, 1.0, 0.0))
-    assert cell_limits(Derating(current_by_cell_temperature=hot)) == (RIDING[0], 55.0)
-    never = DeratingCurve((0.0, 55.0), (0.9, 0.5))
-    assert cell_limits(Derating(current_by_cell_temperature=never)) == RIDING
+    assert cell_limits(Derating()) == RIDING_DEGC
+    hot = PiecewiseLinear((0.0, 55.0, 60.0), (1.0, 1.0, 0.0))
+    assert cell_limits(Derating(current_by_cell_temperature=hot)) == (RIDING_DEGC[0], 55.0)
+    never = PiecewiseLinear((0.0, 55.0), (0.9, 0.5))
+    assert cell_limits(Derating(current_by_cell_temperature=never)) == RIDING_DEGC
 
 
 # --- the day ------------------------------------------------------------------------------------------------------
@@ -215,7 +216,7 @@ def test_a_board_that_does_not_know_the_time_yet_begins_no_day(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
     assert ridden(tmp_path / "none" / "day.json", (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
-    assert "where the day began is not kept" in capsys.readouterr().err
+    assert "the start of the day is not kept" in capsys.readouterr().err
 
 
 # --- the command --------------------------------------------------------------------------------------------------
@@ -235,13 +236,13 @@ def test_the_vehicle_of_the_page(arguments, status):
     assert cli.main([*WEB, "--duration", "0.1", *arguments]) == status
 
 
-@pytest.mark.parametrize("shows", [view_of, range_view])
-def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, shows):
+@pytest.mark.parametrize("own_frames", [True, False])
+def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, own_frames):
     """As `vehicle new` writes them: nobody need write a DBC file for the dashboard."""
     file = tmp_path / "v.toml"
     new = ["--kind", "scooter", "--cells", "nmc", "--series", "14", "--capacity", "30", "--mass", "110"]
     assert cli.main(["vehicle", "new", str(file), *new, "--wheel-radius", "0.22"]) == 0
-    view = shows(argparse.Namespace(vehicle=str(file), dbc=None))
+    view = view_of(argparse.Namespace(vehicle=str(file), dbc=None), own_frames=own_frames)
     frames = second(read_vehicle(file).publisher(), HEALTHY)
     assert min(frame[1] for frame in frames) == 0x6A0
     assert {frame[1] for frame in frames} <= set(view.identifiers or [])
@@ -256,13 +257,7 @@ def test_only_the_page_keeps_a_day(capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        (".", ".: is a folder"),
-        ("", ".: is a folder"),
-        ("v.toml", "would overwrite the input"),
-        ("/dev/null", "is not a file"),
-    ],
+    ("name", "said"), [(".", ".: is a folder"), ("", ".: is a folder"), ("v.toml", "would overwrite the input")]
 )
 def test_a_day_that_cannot_be_kept_is_refused_at_the_start(tmp_path, monkeypatch, capsys, name, said):
     monkeypatch.chdir(tmp_path)

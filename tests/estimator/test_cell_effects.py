@@ -58,7 +58,7 @@ def test_a_current_that_nobody_asked_for_in_a_while_is_followed_anew():
 
 def test_a_resistance_learned_from_quick_changes_says_nothing_of_what_takes_half_an_hour():
     """The reaction of a cell with half as much resistance more loses more, and slow relaxation what the file says."""
-    assert {"charge_transfer", "slow_relaxation"} <= {x.effect.name for _, x in MODEL.cell_voltage}
+    assert {"charge_transfer", "slow_relaxation"} <= {effect.name for effect in MODEL.effects}
     aged = PACK.own()
     aged.age(0.8, 1.5)
     lost = {}

@@ -404,7 +404,7 @@ def test_a_restart_keeps_what_was_shown():
 def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effects):
     """Against small steps: each loses what its temperature makes it lose, the air takes its share."""
     lost = VEHICLE.model.overpotential(VEHICLE.pack, {"vibration": 0.0, "time_moving": 3600.0}) if effects else None
-    cooling = LumpedCooling.of(VEHICLE.model.parameters, "pack", start)
+    cooling = LumpedCooling(VEHICLE.model.parameters, "pack", start)
     expected = Expected(95.0, 800.0, 2.5, 0.01, 20.0)
     pack, charge, temperatures = VEHICLE.pack, 0.8, []
     while charge > 0:

@@ -307,7 +307,7 @@ def test_what_a_route_made_of_the_range_is_not_kept_over_a_restart():
     calm = rider.forecaster.calm
     rider.settled()
     calm.gap = 9e3
-    assert calm.snapshot() == {"gap": 0.0}
+    assert calm.snapshot() == {"gap": 0.0, "forecast": None}
     rider.ahead.follow(None)
     rider.forecaster.shown(rider.ask())
     assert calm.snapshot()["forecast"] == [FREE.range, FREE.energy]

@@ -42,7 +42,7 @@ def ridden(vehicle: Vehicle, seconds: float, cells: float = 60.0, air: float = 1
 def by_network(vehicle: Vehicle, seconds: float) -> float:
     """The cells' temperature [degC] by the pack's cooling network, written out."""
     battery, p = vehicle.pack, vehicle.parameters
-    network, cell = LumpedCooling.of(p, "pack", CELLS), AMPERES / battery.cells_parallel
+    network, cell = LumpedCooling(p, "pack", CELLS), AMPERES / battery.cells_parallel
     r0, r1, _ = battery.circuit(0.85, CELLS)
     lost = r0 * cell + r1 * cell + ridden(vehicle, 60.0).soc.effects.overpotential
     watts = battery.cells_series * lost * AMPERES + p["pack_series_resistance"] * AMPERES**2

@@ -18,7 +18,7 @@ from gz_onboard.estimator.signals import Signal
 from gz_onboard.estimator.vibration import SETTLED, VibrationMonitor
 from gz_onboard.events import WINDOW, Group, RoleWindow
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.vibration import Vibration
+from gz_onboard.physics.sensors import Vibration
 from gz_onboard.simulation.frames import batches, simulate_frames
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter

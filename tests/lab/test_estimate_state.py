@@ -282,7 +282,7 @@ def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
     with later.open("wb") as stream:
         frames = [frame for batch in read_frames(short) for frame in batch]
         write_blf(stream, [[(t + 600 * S, i, data, channel) for t, i, data, channel in frames]])
-    assert "is of 'reference-scooter-17', this is 'reference-scooter-18'" in refused(
+    assert "effects: ['reference-scooter-17'] saved, ['reference-scooter-18'] in" in refused(
         out, capsys, later, options=["--vehicle-id", "18"]
     )
     assert estimate(out, later, options=["--vehicle-id", "17"]) == 0
@@ -349,7 +349,7 @@ def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):
     assert "before the state" in refused(out, capsys, short)
     before = state.encode(snapshot(out / "s.json"), 1.7e9)
     (out / "s.json").write_bytes(before)
-    assert "is of 'reference-scooter', this is 'another'" in refused(
+    assert "effects: ['reference-scooter'] saved, ['another'] in this vehicle file" in refused(
         out, capsys, short, options=["--vehicle", tmp_path / "other.toml"]
     )
     (out / "s.json").write_bytes(before[:-9])

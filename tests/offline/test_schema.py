@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from gz_onboard.lab.discover.result import (
-    Cause,
     Errors,
-    Estimate,
+    FoundCause,
     Gain,
     Isolability,
     Limit,
+    ParameterEstimate,
     Report,
     ResidualSize,
     Score,
@@ -53,7 +53,7 @@ def test_the_report_of_a_discovery_has_the_keys_that_it_explains():
     report = Report(
         "ambiguous",
         [
-            Cause(
+            FoundCause(
                 "headwind",
                 "wind_north",
                 3.0,
@@ -63,7 +63,7 @@ def test_the_report_of_a_discovery_has_the_keys_that_it_explains():
                 0.1,
                 30.0,
                 True,
-                {"wind_east": Estimate(1.0, interval)},
+                {"wind_east": ParameterEstimate(1.0, interval)},
             )
         ],
         [["a", "b"]],

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
 from gz_onboard.physics.effect import Port, load_effect
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import Model, first_soc
-from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -270,10 +270,10 @@ def test_a_resistance_beside_equals_one_inside(soc):
 
 
 def test_heat_of_the_reaction_turns_with_the_current_and_with_the_entropy():
-    battery = replace(BATTERY, entropy_soc=(0.2, 0.8), entropy_value=(-4e-4, 2e-4))
+    battery = replace(BATTERY, entropy=PiecewiseLinear((0.2, 0.8), (-4e-4, 2e-4)))
     assert battery.reversible_heat(10.0, 0.0, 25.0) == pytest.approx(battery.cells_series * 4e-4 * 10 * 298.15)
     assert battery.reversible_heat(-10.0, 0.6, 25.0) == pytest.approx(0.0, abs=1e-9)
     many = battery.reversible_heat(np.array([10.0, -10.0]), np.array([0.9, 0.9]), np.array([0.0, 0.0]))
     assert many == pytest.approx([-2e-3 * battery.cells_series * 273.15, 2e-3 * battery.cells_series * 273.15])
-    none = replace(battery, entropy_soc=(), entropy_value=())
+    none = replace(battery, entropy=None)
     assert none.reversible_heat(10.0, 0.5, 25.0) == 0

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.physics.derating import Derating, DeratingCurve
+from gz_onboard.physics.derating import Derating
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.vehicle import OWN, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
@@ -26,8 +27,8 @@ def test_a_curve_is_linear_between_its_points_and_constant_beyond(points, x):
 
     at = np.cumsum([width for width, _ in points])
     share = [y for _, y in points]
-    curve = DeratingCurve(tuple(at.tolist()), tuple(share))
-    assert curve(x) == pytest.approx(float(np.interp(x, at, share)), abs=1e-9)
+    curve = PiecewiseLinear(tuple(at.tolist()), tuple(share))
+    assert curve.at(x) == pytest.approx(float(np.interp(x, at, share)), abs=1e-9)
 
 
 def test_without_a_table_nothing_is_taken_off(tmp_path):
@@ -38,7 +39,7 @@ def test_without_a_table_nothing_is_taken_off(tmp_path):
     assert derating == Derating() != read_vehicle("reference").derating
     assert derating.regeneration_gain == 1.0
     curves = [getattr(derating, entry.name) for entry in fields(Derating) if entry.name != "regeneration_gain"]
-    assert all(curve(x) == 1.0 for curve in curves for x in (-40.0, 0.0, 0.02, 1.0, 55.4, 150.0, 5000.0))
+    assert all(curve.at(x) == 1.0 for curve in curves for x in (-40.0, 0.0, 0.02, 1.0, 55.4, 150.0, 5000.0))
 
 
 def test_what_the_file_says_counts_the_rest_is_default(tmp_path):
@@ -46,7 +47,7 @@ def test_what_the_file_says_counts_the_rest_is_default(tmp_path):
     lines = '[controller]\ncurrent_by_soc = { at = [0.0, 0.5], share = [0.2, 0.9], unit = "1" }\n'
     file.write_text(REFERENCE.replace(CONTROLLER, lines))
     derating = read_vehicle(str(file)).derating
-    assert derating.current_by_soc(0.25) == pytest.approx(0.55)
+    assert derating.current_by_soc.at(0.25) == pytest.approx(0.55)
     assert derating.current_by_motor_speed == Derating().current_by_motor_speed
 
 

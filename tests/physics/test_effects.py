@@ -51,8 +51,8 @@ ALL = {name: st.floats(*LIMITS[name], allow_subnormal=False) for name in QUANTIT
 
 
 def call(effect, values, **replaced):
-    keywords = {name: PRIORS[name] for name in effect.keywords} | replaced
-    return effect.term(*[values[name] for name in effect.quantities], **keywords)
+    keywords = {name: PRIORS[name] for name in effect.term.parameters} | replaced
+    return effect.term(*[values[name] for name in effect.term.quantities], **keywords)
 
 
 def test_the_limits_cover_every_quantity():
@@ -84,7 +84,7 @@ class TestContract:
     @given(values=st.fixed_dictionaries(quantities()))
     def test_zero_parameters_zero_term(self, effect, values):
         sizes = [p for p in effect.parameters if p.unit != "s" and not (p.unit == "1" and p.low > 0)]
-        own = {p.name: 0.0 for p in sizes if p.name in effect.keywords}
+        own = {p.name: 0.0 for p in sizes if p.name in effect.term.parameters}
         if own:
             assert call(effect, values, **own) == 0
 
@@ -210,7 +210,7 @@ def test_a_user_effect_is_one_file(tmp_path: Path):
     )
     effect = load_effect("cornering_test", tmp_path)
     assert effect.term(3.0, test_force=2.0) == 6.0
-    assert effect.quantities == ("speed",)
+    assert effect.term.quantities == ("speed",)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.arrays import block_means
-from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
@@ -25,9 +24,9 @@ from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
-from gz_onboard.physics.model import air_density
-from gz_onboard.physics.tables import Mesh, bilinear_over, extended, extended_over, linear
-from gz_onboard.simulation.parts.battery import EffectPack
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, bilinear_over, extended, extended_over, linear
+from gz_onboard.physics.model import air_density, stepper
+from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
@@ -163,7 +162,7 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
         rest_shift=shift,
         reaction=Reaction(P["charge_transfer_resistance"], P["charge_transfer_activation"], P["charge_transfer_time"]),
     )
-    each = PACK.capacity * PACK.capacity_share_over(celsius)
+    each = PACK.capacity * PACK.capacity_share.over(celsius)
     soc = SOC - np.cumsum(i * dt / (3600 * each))
     ends = voltage(cell, i, i, dt, soc, celsius)
     assert ends[::2] == pytest.approx(written_out(ride)[0], abs=0.2 * MILLIVOLT)
@@ -172,7 +171,8 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
 def test_the_simulation_draws_the_same_current_and_heat(ride):
     volts, heat = written_out(ride)
     quantities = dict.fromkeys(QUANTITIES, 0.0)
-    pack, drawn = EffectPack(PACK, SOC, CellEffects(VEHICLE.model, PACK), quantities), []
+    effects = stepper(VEHICLE.model.at(Port.CELL_VOLTAGE), 0.1)
+    pack, drawn = FirstOrderPack(PACK, SOC, effects=effects, quantities=quantities), []
     for k, celsius in enumerate(ride["cell_temperature"]):
         watts = PACK.pack_voltage(volts[k], ride["pack_current"][k]) * ride["pack_current"][k]
         steps = [pack.draw(watts, 0.1, celsius) for _ in range(10)]
@@ -190,7 +190,8 @@ def test_validation_and_calibration_warm_the_cells_alike(ride):
     series = PACK.cells_series * ride["pack_current"]
     lost = (rest - ride["pack_voltage"]) * ride["pack_current"]
     run = calibration_run(ride, pack_heat=lost, series_current=series, soc=count)
-    disorder = dict(zip(ENTROPY, np.interp(ENTROPY_SOC, PACK.entropy_soc, PACK.entropy_value), strict=True))
+    assert PACK.entropy
+    disorder = dict(zip(ENTROPY, PACK.entropy.over(np.array(ENTROPY_SOC)), strict=True))
     exposed = dict(P) | {"pack_conductance": P["pack_conductance"] * P["cooling_factor"]} | disorder
     start = float(ride["cell_temperature"][0]) - pack_temperatures(exposed, run)["cell_temperature"][0]
     by_calibration = pack_temperatures(exposed | {"start:ride:cell_temperature": start}, run)["cell_temperature"]
@@ -277,7 +278,8 @@ def test_validation_discovery_and_simulation_warm_the_inverter_alike(ride):
 def test_everyone_has_the_same_heat_of_the_reaction(ride):
     """What the cells are warmer by with the file's entropy than with one that is 1 mV/K lower: I·T·1 mV/K."""
     values, system = healthy()
-    lower = replace(PACK, entropy_value=tuple(x - 1e-3 for x in PACK.entropy_value))
+    assert PACK.entropy
+    lower = replace(PACK, entropy=PiecewiseLinear(PACK.entropy.x, tuple(x - 1e-3 for x in PACK.entropy.y)))
     kelvin = ride["cell_temperature"] + 273.15
     expected = 1e-3 * PACK.cells_series * np.cumsum(ride["pack_current"] * kelvin) / P["pack_heat_capacity"]
     grid, other = on_grid(ride), replace(VEHICLE, battery=lower)
@@ -355,6 +357,6 @@ def test_a_table_is_read_alike_one_value_or_many_at_a_time(data, xs, ys):
 
 
 def test_a_battery_that_rests_lower_in_the_cold_does_so_for_a_whole_ride():
-    cold = replace(PACK, rest_shift_temperature=(-10.0, 25.0), rest_shift_value=(-0.03, 0.0))
+    cold = replace(PACK, rest_shift_curve=PiecewiseLinear((-10.0, 25.0), (-0.03, 0.0)))
     soc, celsius = np.array([0.1, 0.5, 1.02]), np.array([-20.0, 5.0, 30.0])
     assert cold.ocv_over(soc, celsius) == pytest.approx([cold.ocv(s, t)[0] for s, t in zip(soc, celsius, strict=True)])

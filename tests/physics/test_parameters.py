@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.physics.similarity import POWERS, USUAL_CELLS
+from gz_onboard.physics.parameters import USUAL_CELLS, declared_parameters
 from gz_onboard.vehicle import OWN, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text()
@@ -112,7 +111,9 @@ def test_cells_that_are_no_number(tmp_path):
 
 def test_laws_are_of_parameters_and_follow_from_those_before():
     order = ["mass", *USUAL_CELLS, *declared_parameters()]
-    assert all(order.index(other) < order.index(name) for name, law in POWERS.items() for other in law)
+    for name, parameter in declared_parameters().items():
+        others = [factor.partition("^")[0] for factor in parameter.grows_with.split()]
+        assert all(order.index(other) < order.index(name) for other in others), name
 
 
 @pytest.mark.parametrize(("name", "unit"), [("drag_area", "m^2"), ("cell_capacity", "Ah"), ("torque_constant", "Nm/A")])

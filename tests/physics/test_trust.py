@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.physics.trust import ROOT, changeable, trusted_users
+from gz_onboard.physics.effect import ROOT, changeable, trusted_users
 
 ME = frozenset((ROOT, os.geteuid()))
 
@@ -36,7 +36,7 @@ def test_what_a_group_can_write_is_not_but_for_the_users_own(file: Path, monkeyp
     file.chmod(0o664)
     os.chown(file, -1, os.getgid())
     for own in (True, False):
-        monkeypatch.setattr("gz_onboard.physics.trust._own_group", lambda *_, own=own: own)
+        monkeypatch.setattr("gz_onboard.physics.effect._is_private_group", lambda *_, own=own: own)
         assert (changeable(file, ME) is None) == own
 
 

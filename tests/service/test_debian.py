@@ -179,7 +179,7 @@ def check_upgrade(newer: Path, listener: Listener) -> None:
     wait_for(lambda: show("ActiveState") == "active" and main_pid() not in (0, pid), 60, "the new one runs")
     assert active()
     told = ["journalctl", "--no-pager", "-u", UNIT, f"_PID={main_pid()}"]
-    wait_for(lambda: "going on from the state saved" in output(*told), 60, "that it goes on from its state")
+    wait_for(lambda: "continuing from the state saved" in output(*told), 60, "that it goes on from its state")
     assert "Of version 9" not in SETTINGS.read_text()
     assert "250K" in NETWORK.read_text()
     listener.next(SOC, 60)

@@ -134,7 +134,7 @@ def test_killed_it_goes_on_where_it_was(service, listener, ride):
     os.kill(pid, signal.SIGKILL)
     wait_for_another(pid, 20)
     assert show("NRestarts") == "1"
-    assert "going on from the state saved" in journal()
+    assert "continuing from the state saved" in journal()
     after = first_soc(listener)
     assert after[SOC] == pytest.approx(before[SOC], abs=1.5)  # it rides on: 3 kW for half a minute take that
     assert after[SIGMA] == pytest.approx(before[SIGMA], abs=0.3)

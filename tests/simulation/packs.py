@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import exp
 
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.tables import Mesh
+from gz_onboard.physics.functions import Mesh
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.backward import RideConditions, backward
-from gz_onboard.physics.effect import known_effects, load_effect
+from gz_onboard.physics.effect import Port, known_effects, load_effect
 from gz_onboard.simulation.cycles import cycle, names
-from gz_onboard.simulation.parts.battery import EffectPack
+from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -43,8 +43,9 @@ def per_metre(run: Run) -> float:
 
 
 def states(scooter: Scooter) -> dict[str, float]:
-    assert isinstance(scooter.pack, EffectPack)
-    return scooter.pack.effects.states
+    assert isinstance(scooter.pack, FirstOrderPack)
+    names = [bound.effect.name for bound in scooter.vehicle.model.at(Port.CELL_VOLTAGE)]
+    return dict(zip(names, scooter.pack.effect_voltages, strict=True))
 
 
 def bends(distance: float) -> tuple[float, float, float]:
@@ -164,8 +165,8 @@ def test_hysteresis_stays_at_rest_and_relaxation_does_not():
     vehicle = extended("slow_relaxation", "ocv_hysteresis", hysteresis_rate=500.0, slow_time=120.0)
     scooter = Scooter(vehicle, straight(), soc=0.8)
     drive(scooter, stop_and_go, 64.0)
-    for _ in range(3000):
-        scooter.pack.draw(0.0, 1.0, 20.0)
+    for _ in range(200_000):
+        scooter.pack.draw(0.0, STEP, 20.0)
     assert abs(states(scooter)["slow_relaxation"]) < 1e-6
     assert states(scooter)["ocv_hysteresis"] > 0.004
 

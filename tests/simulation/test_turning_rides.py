@@ -20,7 +20,7 @@ from gz_onboard.simulation.parts.chassis import HARDEST, MODELS, chassis, steady
 from gz_onboard.simulation.run import drive, follow, road_table
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.turning.leaning import Leaning
-from gz_onboard.simulation.turning.machine import Machine, Road
+from gz_onboard.simulation.turning.machine import Machine, RoadConditions
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import find_vehicle, read_vehicle
@@ -37,7 +37,7 @@ def test_a_steady_turn_is_where_the_ridden_one_settles(kind, speed, roll):
     model = kind(Machine.of(P))
     ridden = held(model, radians(-roll), speed)
     state, steer = steady_turn(model, speed, ridden.seen["yaw_rate"])
-    seen = model.rates(state, steer, None, Road()).seen
+    seen = model.rates(state, steer, None, RoadConditions()).seen
     for name in ("drive", "load_front", "slip_front", "slip_rear", "lean", "rolling_radius"):
         assert seen[name] == pytest.approx(ridden.seen[name], rel=1e-5)
 
@@ -47,8 +47,8 @@ def test_a_steady_turn_is_where_the_ridden_one_settles(kind, speed, roll):
 def test_the_scooter_rides_the_turn_of_the_model(name, speed, lateral):
     model = {"planar": Planar, "leaning": Leaning}[name](Machine.of(P))
     state, steer = steady_turn(model, speed, abs(lateral) / speed)
-    seen = model.rates(state, steer, None, Road()).seen
-    drag, _ = model.machine.resistance(speed, Road())
+    seen = model.rates(state, steer, None, RoadConditions()).seen
+    drag, _ = model.machine.resistance(speed, RoadConditions())
     expected = seen["drive"] - drag - model.machine.rolling(speed) * model.machine.mass * GRAVITY
     scooter = Scooter(VEHICLE, lambda _: (0.0, lateral / speed**2, 0.0), soc=0.8, speed=speed, chassis=chassis(name, P))
     run = drive(scooter, follow([speed] * 3000, 0.01), 30.0)

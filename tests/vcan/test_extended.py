@@ -81,7 +81,7 @@ def test_an_extended_model_runs_as_it_is_and_expects_less_range(running: Running
     for name in ("extended", "base"):
         running.daemon("--vehicle", str(file), "--effects", str(file.parent / "effects"), name=name).stop()
     own, foreign = (daemon.journal.removeprefix(old) for daemon, old in zip((more, base), journals, strict=True))
-    assert "going on from the state" in own
+    assert "continuing from the state" in own
     assert "not used" in foreign
     assert "ocv_hysteresis" in foreign  # it says which models do not agree
 

@@ -114,7 +114,7 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     uptime = time.clock_gettime(time.CLOCK_BOOTTIME)  # the guest has no clock of its own: without it no age is known
     state.write(folder / f"{reference().name}.json", state.encode(snapshot, time.time(), uptime))
     daemon = running.daemon()
-    assert "going on from the state saved" in daemon.journal
+    assert "continuing from the state saved" in daemon.journal
     replay = running.replay(city, "--from", "200")
     listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
     with hold_ups() as held_up:
@@ -443,4 +443,4 @@ def test_killed_again_and_again_every_log_is_read(running: Running, listener: Li
     daemon.stop()
     assert len(daemon.logs) == 5
     assert all(raw_frames(log) for log in daemon.logs)
-    assert daemon.journal.count("going on from the state saved") == 4
+    assert daemon.journal.count("continuing from the state saved") == 4

@@ -54,7 +54,7 @@ def test_the_map_ends_where_the_controller_does(vehicle):
     x, y = np.meshgrid(maps.speed, maps.torque)
     assert not shown[(y > maps.most) | (y < maps.least)].any()
     assert shown[(y < maps.most) & (y > 5)].all()
-    assert maps.speed[-1] == vehicle.derating.current_by_motor_speed.at[-1]
+    assert maps.speed[-1] == vehicle.derating.current_by_motor_speed.x[-1]
     limit = vehicle.parameters["torque_constant"] * vehicle.parameters["motor_current_limit"]
     assert 0.97 * limit < maps.most.max() < limit  # less the drag
     assert not shown[(x < 7) & (y < -3)].any()  # it does not regenerate that slowly

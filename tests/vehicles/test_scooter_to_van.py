@@ -17,7 +17,7 @@ from cantools.database.can import Database
 
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.interval import DECILE
-from gz_onboard.events import Estimate, Frame, Reason, State
+from gz_onboard.events import WINDOW, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import ROOT
@@ -236,7 +236,7 @@ def test_energy_state_of_charge_and_range(vehicle):
     drawn: list[float] = []
 
     def observe(e: Estimate) -> None:
-        drawn.append((e.pack_voltage or 0.0) * (e.pack_current or 0.0) * STEP)
+        drawn.append((e.pack_voltage or 0.0) * (e.pack_current or 0.0) * WINDOW)
 
     pipeline = Pipeline(vehicle, observer=observe)
     truth = Truth(0.8)

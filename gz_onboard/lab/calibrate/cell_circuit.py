@@ -17,8 +17,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.physics.battery import terminal_voltage
 from gz_onboard.physics.effects import charge_transfer
-from gz_onboard.physics.relaxation import relaxation, relaxed
-from gz_onboard.physics.tables import bilinear_over, extended_over
+from gz_onboard.physics.functions import bilinear_over, extended_over, relaxation, relaxed
 
 *FOUND, REACTIONS = charge_transfer.PARAMETERS
 """Those that pulses show, and the number of reactions. Pulses alone would take more of them, and road profiles held out

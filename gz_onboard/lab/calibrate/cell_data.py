@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gz_onboard.arrays import Array
 from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery_file import TEMPERATURE
+from gz_onboard.physics.battery_file import LIMITS
 
 FEWEST = 50  # samples
 VOLTAGE = (0.2, 6.0)  # V: of one cell of any chemistry, under any load
@@ -108,7 +108,7 @@ def _regular(dt: Array) -> bool:
 
 def _check_units(table: Measurements) -> None:
     """What no cell has is a wrong unit, a pack, or a sample that was lost."""
-    for name, unit, (low, high) in (("voltage", "V", VOLTAGE), ("cell_temperature", "degC", TEMPERATURE)):
+    for name, unit, (low, high) in (("voltage", "V", VOLTAGE), ("cell_temperature", "degC", LIMITS.temperature)):
         outside = np.flatnonzero((table[name] < low) | (table[name] > high))
         if len(outside):
             row, more = int(outside[0]), f" (and at {len(outside) - 1} more samples)" if len(outside) > 1 else ""

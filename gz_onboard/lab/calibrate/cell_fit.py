@@ -22,7 +22,7 @@ from gz_onboard.arrays import Array, bends
 from gz_onboard.constants import KELVIN
 from gz_onboard.lab.calibrate.cell_circuit import follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
-from gz_onboard.physics.relaxation import decay_over
+from gz_onboard.physics.functions import decay_over
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
 # of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.

@@ -201,7 +201,7 @@ def covariance_with_inputs(
     solution = road.solution
     value = about.values()
     base = {name: value[name] for name in NAMES}
-    motor = [n for e in vehicle.model.effects if e.port is Port.MOTOR_LOSS for n in e.keywords if p.sd(n) > 0]
+    motor = [n for e in vehicle.model.effects if e.port is Port.MOTOR_LOSS for n in e.term.parameters if p.sd(n) > 0]
     drag = [
         n for n in dict.fromkeys(["wheel_inertia_front", "wheel_inertia_rear", "wheel_radius", *motor]) if p.sd(n) > 0
     ]

@@ -25,7 +25,8 @@ ENTROPY = tuple(f"entropy_{soc:g}" for soc in ENTROPY_SOC)
 
 def motor_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the stator. The rotor has no sensor and starts as warm as the stator."""
-    network = MotorCooling.of(p, _first(p, run, "motor_temperature"))
+    start = _first(p, run, "motor_temperature")
+    network = MotorCooling(p, start, start)
     columns = run.motor_heat, run.ambient, run.air, np.ones_like(run.air), run.iron
     return {"motor_temperature": np.array(temperatures(network, PERIOD, *columns))}
 
@@ -36,7 +37,7 @@ def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     box = _first(
         p, run, "inverter_box_temperature" if "inverter_box_temperature" in run.measured else "inverter_temperature"
     )
-    network = InverterCooling.of(p, board, box)
+    network = InverterCooling(p, board, box)
     result = np.empty((2, len(run.time)))
     rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), run.air.tolist(), strict=True)
     for k, (heat, ambient, air) in enumerate(rows):
@@ -50,13 +51,13 @@ def pack_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     entropy = np.interp(run.soc, ENTROPY_SOC, [p.get(name, 0.0) for name in ENTROPY])
     cells = run.measured["cell_temperature"]
     heat = run.pack_heat + reversible_heat(entropy, run.series_current, cells)
-    network = LumpedCooling.of(p, "pack", _first(p, run, "cell_temperature"))
+    network = LumpedCooling(p, "pack", _first(p, run, "cell_temperature"))
     return {"cell_temperature": np.array(temperatures(network, PERIOD, heat, run.ambient))}
 
 
 def bms_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the BMS, over the pack's temperature as measured."""
-    network = LumpedCooling.of(p, "bms", _first(p, run, "bms_temperature"))
+    network = LumpedCooling(p, "bms", _first(p, run, "bms_temperature"))
     heat, cells = p["bms_resistance"] * run.pack_square, run.measured["cell_temperature"]
     return {"bms_temperature": np.array(temperatures(network, PERIOD, heat, cells))}
 

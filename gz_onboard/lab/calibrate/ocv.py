@@ -14,7 +14,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.ocv_sweep import REST, REST_AT_BEGIN, UNEXPLAINED, Sweep, find_sweep
+from gz_onboard.lab.calibrate.ocv_sweep import REST, REST_AT_BEGIN, UNEXPLAINED, OcvSweep, find_sweep
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.table import Measurements
 
@@ -67,7 +67,7 @@ def calibrate(table: Measurements) -> Result:
     return result
 
 
-def _half_gap(sweep: Sweep, result: Result) -> tuple[Sweep, Array]:
+def _half_gap(sweep: OcvSweep, result: Result) -> tuple[OcvSweep, Array]:
     """(`sweep`, its resistance none if it is more than the gap holds; half the gap [V] at the nodes, or nan)."""
     test = sweep.test
     if not np.any(sweep.up):
@@ -101,7 +101,7 @@ def _flatness(value: Array, sd: Array, result: Result) -> None:
         )
 
 
-def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
+def _between(sweep: OcvSweep, half: Array, result: Result) -> tuple[Array, Array]:
     """(voltage, its sd) [V] at the nodes: the discharge moved up by half the gap, where that is known or near."""
     discharge = _smooth(sweep.level[sweep.down], sweep.test.voltage[sweep.down], SOC)
     resistive, both = sweep.resistive, np.isfinite(half)
@@ -127,7 +127,7 @@ def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
     return value, np.where(ends & ~np.isfinite(sd), np.nanmax(sd), sd)
 
 
-def _panels(sweep: Sweep, value: Array, sd: Array, half: Array) -> list[Panel]:
+def _panels(sweep: OcvSweep, value: Array, sd: Array, half: Array) -> list[Panel]:
     branches = [
         PlotLine(name, sweep.level[part], sweep.test.voltage[part], ".")
         for name, part in (("discharge", sweep.down), ("charge", sweep.up))
@@ -154,7 +154,7 @@ def _smooth(level: Array, volts: Array, soc: Array) -> Array:
     return result
 
 
-def _ends(sweep: Sweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
+def _ends(sweep: OcvSweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
     """Full and empty are where the cell rested, if it did: there the branches differ by their transients most."""
     value, sd = value.copy(), sd.copy()
     test, last = sweep.test, sweep.last

@@ -24,7 +24,7 @@ SWITCHED, LONGEST_SWITCH = 120.0, 1000.0  # s after switching the current: where
 
 
 @dataclass(frozen=True)
-class Sweep:
+class OcvSweep:
     """A slow discharge, and the charge that belongs to it; `down` and `up` are their samples, `up` may be empty.
 
     own: whether the charge's state of charge is by its own charge, since that of the discharge does not agree.
@@ -109,12 +109,12 @@ class Sweep:
         return self.resistance * self.current
 
 
-def find_sweep(test: CellTest, result: Result) -> Sweep:
+def find_sweep(test: CellTest, result: Result) -> OcvSweep:
     """The longest discharge of `test` and its charge, without that if it is no counterpart, which `result` then says.
 
     Raises InputError for no discharge, one that is too fast or in pieces, or a charge that no cell takes.
     """
-    sweep = Sweep(test, *_branches(test))
+    sweep = OcvSweep(test, *_branches(test))
     if not np.any(sweep.down):
         raise test.table.error("there is no discharge: its current must be positive")
     if sweep.hours < SLOWEST_HOURS:
@@ -130,7 +130,7 @@ def find_sweep(test: CellTest, result: Result) -> Sweep:
     return _paired(replace(sweep, resistance=_resistance(sweep)), result)
 
 
-def _paired(sweep: Sweep, result: Result) -> Sweep:
+def _paired(sweep: OcvSweep, result: Result) -> OcvSweep:
     """`sweep` without a charge that is no counterpart of its discharge, or with that by its own charge."""
     test, up = sweep.test, sweep.up
     if not np.any(up):
@@ -187,7 +187,7 @@ def _branches(test: CellTest) -> tuple[Mask, Mask]:
     return down, after if np.any(after) else longest(-1)
 
 
-def _resistance(sweep: Sweep) -> float:
+def _resistance(sweep: OcvSweep) -> float:
     """Resistance [ohm] within some two minutes of switching the current on, else at switching it off."""
     test, first, last = sweep.test, sweep.first, sweep.last
     if sweep.rested and test.dt[first] < LONGEST_SWITCH:

@@ -20,8 +20,8 @@ from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
+from gz_onboard.physics.functions import decay_over
 from gz_onboard.physics.model import first_soc, standing_load
-from gz_onboard.physics.relaxation import decay_over
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 

@@ -33,7 +33,7 @@ class RoadLoad:
         p = dict(vehicle.parameters) | dict(values or {})
         self.p = p
         effects = [Bound(effect, p) for effect in vehicle.model.effects]
-        self._road = [e for e in effects if e.effect.port in ROAD_LOAD and "acceleration" not in e.effect.quantities]
+        self._road = [e for e in effects if e.effect.port in ROAD_LOAD and "acceleration" not in e.effect.reads]
         self._motor = [e for e in effects if e.effect.port is Port.MOTOR_LOSS]
         self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
         self.rotating = rotating_mass(p)

@@ -20,8 +20,7 @@ from gz_onboard.lab.calibrate import toml_text
 from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.toml_text import KeyPath, number, spliced, string, with_keys
-from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
-from gz_onboard.physics.model import BASE_EFFECTS
+from gz_onboard.physics.effect import BASE_EFFECTS, PACKAGE_EFFECTS, Effect
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle, read_vehicle
 

@@ -59,7 +59,7 @@ def adopted(vehicle: Vehicle, mixed: MixedModel, before: MixedModel) -> Vehicle:
     sd = np.sqrt(np.diag(mixed.prior)) * mixed.scale
     at = mixed.values_at(mixed.mean)
     declared = declared_parameters(vehicle.model.effects)
-    model = {name for effect in vehicle.model.effects for name in effect.keywords}
+    model = {name for effect in vehicle.model.effects for name in effect.term.parameters}
     for name, s in zip(mixed.names, sd, strict=True):
         if name in known and (name in model or not known[name].source.startswith("prior:")):
             old = known[name]

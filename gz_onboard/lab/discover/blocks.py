@@ -21,7 +21,7 @@ def depends(channel: Channel, effects: Sequence[Effect]) -> set[str]:
     names = set(channel.parameters)
     for effect in effects:
         if effect.port in channel.ports and not effect.stores_energy:
-            names |= {*effect.keywords, *effect.decay_keywords}
+            names |= effect.takes
     return names
 
 

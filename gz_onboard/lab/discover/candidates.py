@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.physics.effect import Effect, Parameter, Port, effects_in, known_effects, load_effect
-from gz_onboard.physics.model import BASE_EFFECTS
+from gz_onboard.physics.effect import BASE_EFFECTS, Effect, Parameter, Port, effects_in, known_effects, load_effect
 from gz_onboard.physics.parameters import declared_parameters
 
 
@@ -34,7 +33,7 @@ class Candidate:
     @property
     def reads(self) -> tuple[str, ...]:
         """The names of those that its effect takes beside them."""
-        return tuple(name for name in self.effect.keywords if name not in self.names) if self.effect else ()
+        return tuple(name for name in self.effect.term.parameters if name not in self.names) if self.effect else ()
 
     @property
     def varies(self) -> bool:

@@ -21,8 +21,8 @@ from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
+from gz_onboard.physics.functions import decay_over, relaxation, relaxed
 from gz_onboard.physics.model import drag_torque, first_soc, standing_load
-from gz_onboard.physics.relaxation import decay_over, relaxation, relaxed
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
@@ -90,8 +90,8 @@ def torque_constant(ride: Ride, p: Values, system: System) -> Array:
 def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> tuple[Any, Any]:
     """(losses fed electrically, losses that drag) [W]. Loss that does not depend on current drags the shaft."""
     terms = system.terms(q, p, STEP, Port.MOTOR_LOSS)
-    fed = [(effect, term) for effect, term in terms if "motor_current" in effect.quantities]
-    drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.quantities]
+    fed = [(effect, term) for effect, term in terms if "motor_current" in effect.term.quantities]
+    drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.term.quantities]
     return summed(fed), summed(drags)
 
 
@@ -186,7 +186,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
     temperature = block_means(ride.quantities["cell_temperature"], SLOW)
     cold = colder(temperature)
-    capacity = p["cell_capacity"] * battery.capacity_share_over(temperature)
+    capacity = p["cell_capacity"] * battery.capacity_share.over(temperature)
     taken = discharged(cell, DT, capacity)
     soc = p["soc_start"] + start_soc(ride, system) - (np.cumsum(taken) - taken / 2)  # at the middle of each step
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
@@ -310,7 +310,7 @@ def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The stator's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
     ambient = float(block_means(ride.quantities["ambient_temperature"], SLOW)[0])
-    network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
+    network = MotorCooling(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
     watts, *idle, _ = _heat(ride, p, system)
     return _warmed(ride, p, ("motor_temperature", "motor_airflow"), network, watts, idle)
 
@@ -318,7 +318,7 @@ def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
-    network = InverterCooling.of(p, board, board + p["box_start"])
+    network = InverterCooling(p, board, board + p["box_start"])
     return _warmed(ride, p, ("inverter_temperature", "inverter_airflow"), network, _heat(ride, p, system)[2])
 
 
@@ -328,5 +328,5 @@ def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     celsius = block_means(ride.quantities["cell_temperature"], SLOW)
     watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
     watts = watts + system.pack.reversible_heat(cell.current, cell.soc, celsius)
-    network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
+    network = LumpedCooling(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
     return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, watts)

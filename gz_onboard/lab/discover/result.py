@@ -31,7 +31,7 @@ NO_INTERVAL = "one ride: no interval"
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A parameter's value once accepted, with its 95 % interval."""
 
     value: float
@@ -40,7 +40,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Cause:
+class FoundCause:
     """A cause that was named. value: of its first parameter once accepted; change: over the healthy one's.
 
     evidence: chi-squared of one degree of freedom that leaving it out costs. varies: from ride to ride, by itself or as
@@ -57,14 +57,14 @@ class Cause:
     energy_share: float
     evidence: float
     varies: bool = False
-    parameters: dict[str, Estimate] = field(default_factory=dict)
+    parameters: dict[str, ParameterEstimate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        first = {self.parameter: Estimate(self.value, self.ci95, self.unit)}
+        first = {self.parameter: ParameterEstimate(self.value, self.ci95, self.unit)}
         object.__setattr__(self, "parameters", first | self.others)
 
     @property
-    def others(self) -> dict[str, Estimate]:
+    def others(self) -> dict[str, ParameterEstimate]:
         """Its parameters but the first."""
         return {name: found for name, found in self.parameters.items() if name != self.parameter}
 
@@ -229,7 +229,7 @@ class Report:
     version: int = field(default=VERSION, init=False)
     verdict: Annotated[str, "cause, none, ambiguous, unknown or inconclusive"]
     causes: Annotated[
-        list[Cause],
+        list[FoundCause],
         "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence (chi-squared of "
         "one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all of them: "
         "value, ci95, unit)",

@@ -13,7 +13,7 @@ from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
 from gz_onboard.physics.model import Bound, value_of
-from gz_onboard.physics.riding import VIBRATION
+from gz_onboard.physics.riding import PriorRiding
 
 Values = Mapping[str, float]
 """Parameters and nuisances by name."""
@@ -27,7 +27,9 @@ class System:
     battery: Battery | None
     healthy: Values  # parameters of the vehicle file
     cells: tuple[Bound, ...] = ()  # the effects in its cells by the vehicle file
-    vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
+    vibration: float = (
+        PriorRiding.vibration
+    )  # m/s², of the vehicle file's prior riding: for rides that did not measure it
     sizes: Sizes = USUAL_SIZES
 
     @property
@@ -52,7 +54,7 @@ class System:
             value = value_of(Bound(effect, p), known, recall)
             if effect.variation:
                 healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
-                value = value * effect.variation.of(known, {**p, **healthy})
+                value = value * effect.variation.at(known, {**p, **healthy})
             found.append((effect, value))
         return found
 

@@ -22,10 +22,10 @@ from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.result import (
     CONSTANT,
     RIDE_TO_RIDE,
-    Cause,
-    Estimate,
+    FoundCause,
     Gain,
     Isolability,
+    ParameterEstimate,
     Report,
     Score,
     Unknown,
@@ -104,7 +104,7 @@ def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:
     return Discovery(report, now.mixed, now.offset, now.lines, now.normals)
 
 
-def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], more: bool) -> str:
+def verdict_of(found: Sequence[FoundCause], sets: Sequence[Sequence[str]], more: bool) -> str:
     """One of `result.VERDICTS`. more: something differs that has no name."""
     if more and not found:
         return "unknown"
@@ -140,7 +140,7 @@ def needs(mixed: MixedModel, cause: Candidate) -> tuple[str, ...]:
     return tuple(sorted(sets, key=lambda text: (text.count(" and "), text)))
 
 
-def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[Cause]:
+def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[FoundCause]:
     """The chosen causes with values and intervals."""
     mixed = search.mixed
     result = []
@@ -153,11 +153,11 @@ def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]
         score = round(search.part(chosen, name), 2)
         more = value - mixed.healthy_value(first.name)
         share = energy_share(lines, change)
-        result.append(Cause(name, first.name, value, first.unit, ci95, more, share, score, parameters=rows))
+        result.append(FoundCause(name, first.name, value, first.unit, ci95, more, share, score, parameters=rows))
     return result
 
 
-def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, Estimate]:
+def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, ParameterEstimate]:
     """The parameters of a cause that change by `change` (k,) [scales], known within `sd` beside the `DISCREPANCY`."""
     mixed = search.mixed
     shares = search.shares.get(name, {})
@@ -169,11 +169,11 @@ def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, 
         at = (float(x), float(x) - wide, float(x) + wide)
         ends = [stepped(parameter.name, healthy, step * y) for y in at]
         value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing that cannot be
-        rows[parameter.name] = Estimate(value, (low, high), parameter.unit)
+        rows[parameter.name] = ParameterEstimate(value, (low, high), parameter.unit)
     return rows
 
 
-def wind_cause(every: Search, chosen: Sequence[str], winds: Winds, lines: Sequence[LinearRide]) -> Cause:
+def wind_cause(every: Search, chosen: Sequence[str], winds: Winds, lines: Sequence[LinearRide]) -> FoundCause:
     """The winds as a cause, of the vector that they have in common."""
     (wind,) = causes_of(every, [*chosen, winds.cause.name], lines)[-1:]
     return replace(wind, evidence=round(winds.score, 2), varies=True)

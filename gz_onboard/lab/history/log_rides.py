@@ -50,7 +50,7 @@ class About:
 
 
 @dataclass
-class Moment:
+class LogMoment:
     """An estimate with what the status of its second says. ride: as of `log_rows.ride_row`."""
 
     time_ns: int
@@ -59,9 +59,9 @@ class Moment:
     ride: Logged
 
 
-def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment], list[Logged]]:
+def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[LogMoment], list[Logged]]:
     """(the estimates of a log with their statuses, the explanations); samples: topic, time [ns], values."""
-    moments: list[Moment] = []
+    moments: list[LogMoment] = []
     whys: list[Logged] = []
     drawn = Drawn(_LONGEST_STEP)
     for topic, time_ns, values in samples:
@@ -71,7 +71,7 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment]
             ride |= {"energy": drawn.net, "energy_recovered": drawn.recovered}  # of a log whose status does not say it
             ride |= {"energy_distance": drawn.distance}
             estimate = {key: values.get(key) for key in _USED}
-            moments.append(Moment(time_ns, estimate, moments[-1].status if moments else {}, ride))
+            moments.append(LogMoment(time_ns, estimate, moments[-1].status if moments else {}, ride))
         elif topic == STATUS_TOPIC and moments and is_status(values):
             status = {key: values[key] for key in _STATUS if key in values}
             if status != moments[-1].status:  # mostly nothing has changed, and six hours are held in memory
@@ -83,14 +83,14 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment]
     return moments, whys
 
 
-def rides_of(moments: Sequence[Moment], whys: Sequence[Logged], about: About) -> list[KeptRide]:
+def rides_of(moments: Sequence[LogMoment], whys: Sequence[Logged], about: About) -> list[KeptRide]:
     """The rides in a log; none if it was parked, or charged, all the time."""
     date = _date(moments)
     rides = (_ride(moments[begin:end], whys, about, date) for begin, end in _spans(moments))
     return [ride for ride in rides if ride.distance_km * 1000 >= LEAST_DISTANCE]
 
 
-def _spans(moments: Sequence[Moment]) -> Iterator[tuple[int, int]]:
+def _spans(moments: Sequence[LogMoment]) -> Iterator[tuple[int, int]]:
     """(first, last + 1) of the moments of each ride."""
     begin, riding = 0, False
     for first, last, stands in _stretches(moments):
@@ -105,7 +105,7 @@ def _spans(moments: Sequence[Moment]) -> Iterator[tuple[int, int]]:
         yield begin, len(moments)
 
 
-def _stretches(moments: Sequence[Moment]) -> Iterator[tuple[int, int, bool]]:
+def _stretches(moments: Sequence[LogMoment]) -> Iterator[tuple[int, int, bool]]:
     """(first, last, whether the vehicle stands) of the stretches of one kind, and without a hole."""
     begin = 0
     for i, moment in enumerate(moments):
@@ -117,7 +117,7 @@ def _stretches(moments: Sequence[Moment]) -> Iterator[tuple[int, int, bool]]:
         begin = i + 1
 
 
-def _ends_a_ride(stand: Sequence[Moment]) -> bool:
+def _ends_a_ride(stand: Sequence[LogMoment]) -> bool:
     charged = [moment for moment in stand if moment.estimate.get("activity") == Activity.CHARGING.name]
     long = _elapsed(stand[0], stand[-1]) >= BREAK
     return long or (bool(charged) and _elapsed(charged[0], charged[-1]) >= CHARGED)
@@ -131,11 +131,11 @@ def _is_ride(values: object) -> bool:
     return all(is_number(value) for value in known if value is not None) and None not in known[:2]
 
 
-def _elapsed(one: Moment, other: Moment) -> float:
+def _elapsed(one: LogMoment, other: LogMoment) -> float:
     return float(other.estimate["time"] - one.estimate["time"])
 
 
-def _date(moments: Sequence[Moment]) -> int:
+def _date(moments: Sequence[LogMoment]) -> int:
     """When the time of the estimates began [ns since the epoch], by the last date that the log's clock had.
 
     The clock of a board may be set while it rides, from 1970 or another zone of time: it is right afterwards.
@@ -144,7 +144,7 @@ def _date(moments: Sequence[Moment]) -> int:
     return next((begin for begin in reversed(begins) if begin >= FIRST_DATE_NS), begins[-1] if begins else 0)
 
 
-def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date: int) -> KeptRide:
+def _ride(moments: Sequence[LogMoment], whys: Sequence[Logged], about: About, date: int) -> KeptRide:
     """The ride of these moments."""
     last = moments[-1].ride
     first = moments[0].ride
@@ -185,7 +185,7 @@ def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date:
     )
 
 
-def _charge_and_range(moments: Sequence[Moment]) -> dict[str, Any]:
+def _charge_and_range(moments: Sequence[LogMoment]) -> dict[str, Any]:
     rows = [moment.estimate for moment in moments]
     charged = [row for row in rows if row.get("soc") is not None]
     ranged = [row for row in rows if row.get("range") is not None and row["state"] in _RANGED]
@@ -197,7 +197,7 @@ def _charge_and_range(moments: Sequence[Moment]) -> dict[str, Any]:
     return found
 
 
-def _on_route(moments: Sequence[Moment], name: str | None) -> dict[str, Any]:
+def _on_route(moments: Sequence[LogMoment], name: str | None) -> dict[str, Any]:
     """The route that was given, and what was ridden on it."""
     states = [moment.estimate.get("route_state", RouteState.NONE.name) for moment in moments]
     if not any(state in (RouteState.ON.name, RouteState.OFF.name) for state in states):
@@ -231,7 +231,7 @@ def _mean(values: Sequence[float]) -> float | None:
     return round(sum(values) / len(values), 2) if values else None
 
 
-def _seconds_in(moments: Sequence[Moment], state: State) -> float:
+def _seconds_in(moments: Sequence[LogMoment], state: State) -> float:
     """Each estimate stands for the time until the next, but for no more than the longest step."""
     total = 0.0
     for i in range(len(moments) - 1):
@@ -240,7 +240,7 @@ def _seconds_in(moments: Sequence[Moment], state: State) -> float:
     return round(total, 1)
 
 
-def _words(moments: Sequence[Moment], key: str) -> str:
+def _words(moments: Sequence[LogMoment], key: str) -> str:
     """The names in a text of the estimates, each once."""
     texts = [text for moment in moments if isinstance(text := moment.estimate[key], str)]
     return " ".join(dict.fromkeys(word for text in texts for word in text.split()))

@@ -46,7 +46,7 @@ class Kept:
 
 
 @dataclass
-class _Found:
+class _FoundRides:
     """A `Kept` as it grows; obsolete: numbers of the rows to be deleted."""
 
     added: list[KeptRide] = field(default_factory=list)
@@ -102,7 +102,7 @@ class Store:
         which a ride clashes is not noted as read.
         """
         with self._transaction():
-            found = _Found()
+            found = _FoundRides()
             for ride in rides:
                 _sort(ride, self._near(ride), found, replace)
             self._db.executemany("DELETE FROM rides WHERE id = ?", [(number,) for number in sorted(found.obsolete)])
@@ -184,7 +184,7 @@ class Store:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
 
 
-def _sort(ride: KeptRide, there: dict[int, KeptRide], found: _Found, replace: bool) -> None:
+def _sort(ride: KeptRide, there: dict[int, KeptRide], found: _FoundRides, replace: bool) -> None:
     """Say what `ride` is beside those that are `there`, of which it takes the place of some."""
     together = {number: other for number, other in there.items() if overlap(other, ride)}
     for number, other in list(together.items()):

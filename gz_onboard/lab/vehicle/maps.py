@@ -115,9 +115,7 @@ def efficiency_maps(
     drag = drag_torque(idle, speed)
     limits = p["torque_constant"] * p["motor_current_limit"], p["regeneration_torque_limit"]
     curves = derating.current_by_motor_speed, derating.regeneration_by_motor_speed
-    driving, braking = (
-        limit * np.array([curve(x) for x in speed.tolist()]) for limit, curve in zip(limits, curves, strict=True)
-    )
+    driving, braking = (limit * curve.over(speed) for limit, curve in zip(limits, curves, strict=True))
     most, least = driving - drag, -braking - drag
     torque = np.linspace(min(float(least.min()), 0.0), float(most.max()), GRID)
     x, y = np.meshgrid(speed, torque)
@@ -130,8 +128,8 @@ def efficiency_maps(
 def _fastest(vehicle: Vehicle, measured: Sequence[Points]) -> float:
     """Up to which speed of the motor [rad/s] the map goes: the controller's limit, else what was measured."""
     curve = vehicle.derating.current_by_motor_speed
-    if curve.share[-1] <= 0:
-        return curve.at[-1]
+    if curve.y[-1] <= 0:
+        return curve.x[-1]
     if measured:
         return max(float(points.speed.max()) for points in measured)
     raise vehicle.error(

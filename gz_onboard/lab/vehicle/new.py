@@ -27,10 +27,9 @@ from gz_onboard.lab.vehicle.cells import (
 )
 from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.kinds import KINDS, LARGE
-from gz_onboard.lab.vehicle.power import Motor
+from gz_onboard.lab.vehicle.power import RatedMotor
 from gz_onboard.options import number
-from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.physics.similarity import MOST_CELLS
+from gz_onboard.physics.parameters import MOST_CELLS, declared_parameters
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -45,7 +44,7 @@ Parser = Callable[[str], Any]
 
 
 @dataclass(frozen=True)
-class Answers:
+class NewVehicleAnswers:
     """What the owner says."""
 
     kind: str
@@ -145,7 +144,7 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def completed(given: Mapping[str, Any], terminal: TextIO | None) -> Answers:
+def completed(given: Mapping[str, Any], terminal: TextIO | None) -> NewVehicleAnswers:
     """Every answer: as given, as asked for on a `terminal`, or the default. InputError for what is missing."""
     answers: dict[str, Any] = {question.key: given.get(question.key) for question in questions()}
     needed = [question for question in questions() if question.default is None and not question.of_kind]
@@ -159,7 +158,7 @@ def completed(given: Mapping[str, Any], terminal: TextIO | None) -> Answers:
     for question in questions():
         if answers[question.key] is None:
             answers[question.key] = question.default
-    return Answers(**answers)
+    return NewVehicleAnswers(**answers)
 
 
 def asked(question: Question, terminal: TextIO) -> Any:
@@ -205,7 +204,7 @@ def write_new(files: Sequence[Path], texts: Sequence[str]) -> None:
         raise InputError(f"{error.filename or files[0]}: cannot be written: {error.strerror}") from error
 
 
-def dbc_text(answers: Answers) -> str:
+def dbc_text(answers: NewVehicleAnswers) -> str:
     """The DBC skeleton: its limits are what the pack can have."""
     chemistry = CHEMISTRIES[answers.cells]
     low, high = MARGIN[0] * chemistry.cutoff[0] * answers.series, MARGIN[1] * chemistry.ocv[-1] * answers.series
@@ -219,7 +218,7 @@ def dbc_text(answers: Answers) -> str:
     )
 
 
-def vehicle_text(name: str, answers: Answers) -> str:
+def vehicle_text(name: str, answers: NewVehicleAnswers) -> str:
     """The vehicle file `name`."""
     kind, chemistry = KINDS[answers.kind], CHEMISTRIES[answers.cells]
     charge = answers.capacity * answers.parallel
@@ -272,10 +271,10 @@ def vehicle_text(name: str, answers: Answers) -> str:
     )
 
 
-def motor_keys(answers: Answers) -> dict[str, str]:
+def motor_keys(answers: NewVehicleAnswers) -> dict[str, str]:
     """What the motor gives at most, for the template: as answered, else as usual for the kind."""
     kind, usual = KINDS[answers.kind], f"usual for a {answers.kind}"
-    motor = Motor(
+    motor = RatedMotor(
         answers.power or kind.power,
         answers.top_speed or kind.top_speed,
         answers.mass + kind.payload[0],

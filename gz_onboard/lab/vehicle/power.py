@@ -11,7 +11,7 @@ STEPS = 1.3  # at most, from one point of the curve to the next, in which a cons
 
 
 @dataclass(frozen=True)
-class Motor:
+class RatedMotor:
     """Peak power at the shaft [W], top speed [km/h], what it moves: mass [kg], pull as it starts [m/s²].
 
     wheel_radius [m], gear_ratio (wheel speed over motor speed) and torque_constant [N·m/A] are those of the file.

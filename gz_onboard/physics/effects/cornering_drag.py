@@ -7,17 +7,24 @@ sec. 1.3). Stiffness grows with load, so one number is left: c = s_f/c_f + s_r/c
 at small angles with a_y² too: c then is what both take together.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.effect import Parameter, Port, Values
+from gz_onboard.physics.functions import direction
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3"
-PARAMETERS = (Parameter("cornering_compliance", "rad", 0.1, 0.05, 0.0, 0.5, SOURCE, ride_sd=0.015, healthy_sd=0.1),)
+PARAMETERS = (
+    Parameter(
+        "cornering_compliance",
+        "rad",
+        prior=0.1,
+        prior_sd=0.05,
+        low=0.0,
+        high=0.5,
+        source="Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3",
+        ride_sd=0.015,
+        healthy_sd=0.1,
+    ),
+)
 TURNING_LOSS = True
 SHOWN_BY = (
     "Road load that grows with the square of speed times yaw rate and is absent on the straight; bends at one speed, "
@@ -25,6 +32,6 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, mass: Any, lateral_acceleration: Any, *, cornering_compliance: float) -> Any:
+def term(speed: Values, mass: Values, lateral_acceleration: Values, *, cornering_compliance: float) -> Values:
     """Force [N] against the motion."""
     return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / GRAVITY * direction(speed)

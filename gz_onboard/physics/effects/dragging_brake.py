@@ -1,24 +1,32 @@
-"""A brake that drags, F = F_b while the vehicle moves: pads rub with a force of their own, whatever the load.
+"""A brake that drags, F = F_b while the vehicle moves: pads rub with the same force at any load.
 
 Coulomb friction of pads that do not come free (Limpert 2011, Brake Design and Safety). Smooth around standstill.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.effect import MASS, Parameter, Port, Values
+from gz_onboard.physics.functions import direction
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "a guess: a free disc takes 1 to 3 N at the tyre"
-PARAMETERS = (Parameter("brake_drag_force", "N", 5.0, 5.0, 0.0, 5000.0, SOURCE, ride_sd=1.0, healthy_sd=1.5),)
+PARAMETERS = (
+    Parameter(
+        "brake_drag_force",
+        "N",
+        prior=5.0,
+        prior_sd=5.0,
+        low=0.0,
+        high=5000.0,
+        source="a guess: a free disc takes 1 to 3 N at the tyre",
+        ride_sd=1.0,
+        healthy_sd=1.5,
+        grows_with=MASS,
+    ),
+)
 SHOWN_BY = (
     "Road load that is the same at all speeds and loads; rides with another payload split it from rolling resistance, "
     "which grows with weight."
 )
 
 
-def term(speed: Any, *, brake_drag_force: float) -> Any:
+def term(speed: Values, *, brake_drag_force: float) -> Values:
     """Force [N] against the motion."""
     return brake_drag_force * direction(speed)

@@ -4,16 +4,22 @@ The viscous part of a bearing's friction torque grows with its speed (Harris & K
 sec. 10.3); unlike the tyres' it does not grow with the load.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import ROTATION, Parameter, Port, Values
 
 PORT = Port.WHEEL_FORCE
-SOURCE = "seals and bearings: 1 N·m at 50 rad/s"
 PARAMETERS = (
-    Parameter("drivetrain_drag_torque", "N·m·s/rad", 0.02, 0.02, 0.0, 50.0, SOURCE, ride_sd=0.005, healthy_sd=0.01),
+    Parameter(
+        "drivetrain_drag_torque",
+        "N·m·s/rad",
+        prior=0.02,
+        prior_sd=0.02,
+        low=0.0,
+        high=50.0,
+        source="seals and bearings: 1 N·m at 50 rad/s",
+        ride_sd=0.005,
+        healthy_sd=0.01,
+        grows_with=ROTATION,
+    ),
 )
 SHOWN_BY = (
     "Road load in proportion to speed, the same at all payloads; rides over all speeds split it from drag area, which "
@@ -21,6 +27,6 @@ SHOWN_BY = (
 )
 
 
-def term(speed: Any, *, drivetrain_drag_torque: float, wheel_radius: float) -> Any:
+def term(speed: Values, *, drivetrain_drag_torque: float, wheel_radius: float) -> Values:
     """Force [N] against the motion."""
     return drivetrain_drag_torque * speed / (wheel_radius * wheel_radius)

@@ -5,19 +5,34 @@ otherwise, so this is the part of the aerodynamic drag (Lord 2016, eq. 3.1) that
 little to the flow's speed and changes C_d, is left out: Cossalter 2006, sec. 3.2, knows the drag area head on only.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 from gz_onboard.physics.effects.aerodynamic_drag import term as drag
-from gz_onboard.physics.elementary import cos, sin
+from gz_onboard.physics.functions import cos, sin
 
 PORT = Port.WHEEL_FORCE
-WEATHER = "at 1 m over ground half of the 3-5 m/s that weather tells"
 PARAMETERS = (
-    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
-    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
+    Parameter(
+        "wind_north",
+        "m/s",
+        prior=0.0,
+        prior_sd=2.0,
+        low=-15.0,
+        high=15.0,
+        source="at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
+    Parameter(
+        "wind_east",
+        "m/s",
+        prior=0.0,
+        prior_sd=2.0,
+        low=-15.0,
+        high=15.0,
+        source="at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
 )
 STRENGTHS = ("wind_north", "wind_east")
 VARIES = True
@@ -28,8 +43,15 @@ SHOWN_BY = (
 
 
 def term(
-    speed: Any, headwind: Any, heading: Any, air_density: Any, *, drag_area: float, wind_north: float, wind_east: float
-) -> Any:
+    speed: Values,
+    headwind: Values,
+    heading: Values,
+    air_density: Values,
+    *,
+    drag_area: float,
+    wind_north: float,
+    wind_east: float,
+) -> Values:
     """Force [N] against the motion."""
     wind = wind_north * cos(heading) + wind_east * sin(heading)
     still = drag(speed, headwind, air_density, drag_area=drag_area)

@@ -1,11 +1,8 @@
 """Inertia of the vehicle and of what rotates, F = (m + J/r²)·dV/dt (Lord 2016, eqs. 2.11, 3.3)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Any
 
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port, Values
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS: tuple[Parameter, ...] = ()
@@ -13,8 +10,8 @@ STORES_ENERGY = True
 
 
 def term(
-    acceleration: Any, mass: Any, *, wheel_inertia_front: float, wheel_inertia_rear: float, wheel_radius: float
-) -> Any:
+    acceleration: Values, mass: Values, *, wheel_inertia_front: float, wheel_inertia_rear: float, wheel_radius: float
+) -> Values:
     """Force [N] against the motion."""
     return (mass + (wheel_inertia_front + wheel_inertia_rear) / wheel_radius**2) * acceleration
 

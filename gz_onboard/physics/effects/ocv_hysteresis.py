@@ -4,20 +4,24 @@ At rest the voltage depends on whether the cell was charged or discharged before
 and stays where it is at rest. Positive when discharging. The sign is smooth below 10 mA of a cell.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.physics.battery import discharged
-from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import exp
+from gz_onboard.physics.effect import Parameter, Port, Values
+from gz_onboard.physics.functions import exp
 
 PORT = Port.CELL_VOLTAGE
-HYSTERESIS = "NMC: Barai et al. 2015, 5 to 20 mV"
-SETTLING = "Plett 2004, part 2: settles within 5 % of SOC"
 PARAMETERS = (
-    Parameter("hysteresis_voltage", "V", 0.01, 0.008, 0.0, 0.1, HYSTERESIS, ride_sd=0.001, healthy_sd=0.005),
-    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, SETTLING),
+    Parameter(
+        "hysteresis_voltage",
+        "V",
+        prior=0.01,
+        prior_sd=0.008,
+        low=0.0,
+        high=0.1,
+        source="NMC: Barai et al. 2015, 5 to 20 mV",
+        ride_sd=0.001,
+        healthy_sd=0.005,
+    ),
+    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, "Plett 2004, part 2: settles within 5 % of SOC"),
 )
 SHOWN_BY = (
     "Voltage that stays low at rest after riding and high after charging or long braking, without coming back; rests "
@@ -26,11 +30,11 @@ SHOWN_BY = (
 SMALL = 0.01  # A
 
 
-def term(cell_current: Any, *, hysteresis_voltage: float) -> Any:
-    """What the terminals lack [V] once settled."""
+def term(cell_current: Values, *, hysteresis_voltage: float) -> Values:
+    """Voltage lost [V] once settled."""
     return hysteresis_voltage * cell_current / (cell_current * cell_current + SMALL * SMALL) ** 0.5
 
 
-def decay(dt: Any, cell_current: Any, cell_capacity: Any, *, hysteresis_rate: float) -> Any:
+def decay(dt: Values, cell_current: Values, cell_capacity: Values, *, hysteresis_rate: float) -> Values:
     """The share that is left after `dt` [s] of `cell_current` [A]."""
     return exp(-hysteresis_rate * discharged(abs(cell_current), dt, cell_capacity))

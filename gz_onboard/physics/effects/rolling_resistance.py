@@ -3,20 +3,32 @@
 Smooth around standstill: the constant term fades below 0.1 m/s, where a scooter that stands is held, not driven.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 from gz_onboard.constants import GRAVITY, MILD
-from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.effect import Parameter, Port, Values
+from gz_onboard.physics.functions import direction
 
 PORT = Port.TYRE
-TYRES = "scooter tyres: Cossalter 2006, sec. 2.3"
-RISE = "SAE J2452: rises by a few percent per m/s"
 PARAMETERS = (
-    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, TYRES, ride_sd=7e-4),
-    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, RISE, ride_sd=2e-5),
+    Parameter(
+        "rolling_resistance_constant",
+        "1",
+        prior=0.015,
+        prior_sd=0.005,
+        low=0.0,
+        high=0.06,
+        source="scooter tyres: Cossalter 2006, sec. 2.3",
+        ride_sd=7e-4,
+    ),
+    Parameter(
+        "rolling_resistance_speed",
+        "s/m",
+        prior=2e-4,
+        prior_sd=2e-4,
+        low=0.0,
+        high=3e-3,
+        source="SAE J2452: rises by a few percent per m/s",
+        ride_sd=2e-5,
+    ),
 )
 CAUSE = ("rolling_resistance", "F = m·g·cos θ·c0")
 SHOWN_BY = (
@@ -26,8 +38,13 @@ SHOWN_BY = (
 
 
 def term(
-    speed: Any, mass: Any, grade_cosine: Any, *, rolling_resistance_constant: float, rolling_resistance_speed: float
-) -> Any:
+    speed: Values,
+    mass: Values,
+    grade_cosine: Values,
+    *,
+    rolling_resistance_constant: float,
+    rolling_resistance_speed: float,
+) -> Values:
     """Force [N] against the motion."""
     return (
         mass
@@ -37,6 +54,6 @@ def term(
     )
 
 
-def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
+def variation(ambient_temperature: Values, *, rolling_cold: float) -> Values:
     """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
     return 1 + rolling_cold * (MILD - ambient_temperature) / MILD

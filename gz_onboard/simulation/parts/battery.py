@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
-from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
-from gz_onboard.physics.relaxation import decay_over, relaxed
+from gz_onboard.physics.functions import decay_over, extended, relaxed
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
 
-class Pack(Protocol):
-    """What the scooter needs of a battery pack."""
+class PackModel(Protocol):
+    """A battery pack, as the scooter uses it."""
 
     soc: float
 
@@ -30,14 +29,25 @@ class Pack(Protocol):
 
 
 class FirstOrderPack:
-    """R0 and one RC pair over SOC and temperature.
+    """R0 and one RC pair over SOC and temperature, and the effects of the vehicle's model in the cells.
 
-    Eq. 2.24 as printed mixes cell and pack voltage; here heat = S·P·(V_oc - V_cell)·I_cell, which counts what the RC
-    pair's capacitor stores for a minute as heat, as the printed form does.
+    effects: a function that gives their voltages [V] after one step, see `physics.model.stepper`; its step is the
+    `dt` of `draw`. They act in the next step. quantities: read by the effects; the pack keeps those of the cells up to
+    date. The voltage lost to effects is heat of the pack. So is the energy that the RC pair's capacitor stores for a
+    minute: heat = S·P·(V_oc - V_cell)·I_cell. Eq. 2.24 as printed mixes cell and pack voltage.
     """
 
-    def __init__(self, battery: Battery, soc: float = 1.0, v1: float = 0.0) -> None:
+    def __init__(
+        self,
+        battery: Battery,
+        soc: float = 1.0,
+        v1: float = 0.0,
+        effects: Callable[[Mapping[str, float]], tuple[float, ...]] | None = None,
+        quantities: dict[str, float] | None = None,
+    ) -> None:
         self.battery = battery
+        self._effects, self._q = effects, {} if quantities is None else quantities
+        self.effect_voltages: tuple[float, ...] = ()  # V of a cell, in the order of the effects
         self.soc = soc
         self.v1 = v1  # V of a cell
         self._age = TABLE_PERIOD
@@ -55,37 +65,44 @@ class FirstOrderPack:
         self._drawn += self._between(self._soc_before, soc)
         self._soc_before = soc
         self._r0, self._r1, self._c1 = battery.circuit(soc, temperature)
+        self._q["cell_temperature"], self._q["cell_capacity"] = temperature, battery.cell_capacity(temperature)
         self._decay, self._decay_dt = decay_over(dt, self._r1 * self._c1), dt
         self._capacity = battery.pack_capacity(temperature)
         self._shift = battery.rest_shift(temperature)
         self._age = 0.0
 
     def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
-        """See `Pack`. The current is the root of V·I = P; where there is none, the current of greatest power."""
+        """See `PackModel`. The current is the root of V·I = P; where there is none, the current of greatest power."""
         if self._age >= TABLE_PERIOD - 1e-9 or dt != self._decay_dt:
             self._look_up(temperature, dt)
         self._age += dt
         battery = self.battery
         n, m = battery.cells_series, battery.cells_parallel
-        ocv, slope = battery.ocv(self.soc)
+        ocv, slope = extended(battery.ocv_soc, battery.ocv_value, self.soc)
         ocv += self._shift
         resistance = n * self._r0 / m + battery.series_resistance
-        source = n * (ocv - self.v1)
+        relaxing = n * (self.v1 + sum(self.effect_voltages))
+        source = n * ocv - relaxing
         current = current_of(power, source, resistance)
         if current is None:
             current = source / (2 * resistance)
         step = discharged(current, dt, self._capacity)
         # V_oc at the middle of the step, so that charge times voltage is the energy between the two SOCs.
         middle = n * (ocv - slope * step / 2)
-        voltage = terminal_voltage(middle, resistance, current, n * self.v1)
+        voltage = terminal_voltage(middle, resistance, current, relaxing)
         self.soc -= step
-        self.v1 = relaxed(self.v1, self._r1 * current / m, self._decay)
+        cell = current / m
+        self.v1 = relaxed(self.v1, self._r1 * cell, self._decay)
+        if self._effects:
+            q = self._q
+            q["cell_current"], q["soc"] = cell, self.soc
+            self.effect_voltages = self._effects(q)
         return current, voltage, heat(middle, voltage, current), voltage * current
 
     def chemical_energy_drawn(self) -> float:
-        """See `Pack`: the integral of V_oc over the charge between the SOC at the start and now.
+        """See `PackModel`: the integral of V_oc over the charge between the SOC at the start and now.
 
-        From the SOC alone, not from what was delivered: the check of the energy balance stands on it.
+        It follows from the SOC alone, not from the energy delivered: the check of the energy balance relies on it.
         """
         return self._drawn + self._between(self._soc_before, self.soc)
 
@@ -98,25 +115,3 @@ class FirstOrderPack:
         total = sum((y - x) * (ocv(x)[0] + ocv(y)[0]) / 2 for x, y in pairwise(knots))
         total += (b - a) * self._shift
         return sign * total * self.battery.cells_series * HOUR * self._capacity
-
-
-class EffectPack(FirstOrderPack):
-    """The first-order pack with effects of the vehicle's model in its cells: slow relaxation, hysteresis, one's own.
-
-    They act on each step with what they were after the one before; what they take from the voltage is heat of the pack.
-    quantities: what the effects read, beside those of the cells.
-    """
-
-    def __init__(self, battery: Battery, soc: float, effects: CellEffects, quantities: Mapping[str, float]) -> None:
-        super().__init__(battery, soc)
-        self.effects, self._q = effects, quantities
-
-    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
-        """See `Pack`."""
-        fast = self.v1
-        self.v1 += self.effects.overpotential
-        drawn = super().draw(power, dt, temperature)
-        cell = drawn[0] / self.battery.cells_parallel
-        self.v1 = relaxed(fast, self._r1 * cell, self._decay)
-        self.effects.step(dt, cell, self.soc, temperature, self._q)
-        return drawn

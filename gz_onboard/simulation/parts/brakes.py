@@ -20,18 +20,17 @@ class Brakes:
     front_share: float = 0.0
     form: str = "friction"
 
-    def torque(self, command: float, wheel_speed: float, to_stop: float) -> float:
-        """Torque [N·m] against a wheel at `wheel_speed` [rad/s]; `to_stop` is what would bring it to rest just now."""
-        if self.form == "viscous":
-            return wheel_speed * command * (1 - self.front_share) * self.viscous_constant * self.radius
-        limit = command * (1 - self.front_share) * self.torque_limit
-        return min(max(to_stop, -limit), limit)
+    def bounds(
+        self, command: float, speed: float, wheel_speed: float, wheel_radius: float
+    ) -> tuple[float, float, float, float]:
+        """Least and greatest force [N] of the front brake, then least and greatest torque [N·m] of the rear brake.
 
-    def front_force(self, command: float, speed: float, wheel_radius: float, to_stop: float) -> float:
-        """Force [N] of the front brake against a vehicle at `speed` [m/s]; `to_stop` as in `torque`."""
+        speed: of the vehicle [m/s]. wheel_speed: of the rear wheel [rad/s]. Both act against the motion.
+        """
+        front, rear = command * self.front_share, command * (1 - self.front_share)
         if self.form == "viscous":
-            return (
-                speed / wheel_radius * command * self.front_share * self.viscous_constant * self.radius / wheel_radius
-            )
-        limit = command * self.front_share * self.torque_limit / wheel_radius
-        return min(max(to_stop, -limit), limit)
+            arm = self.viscous_constant * self.radius
+            force, torque = speed / wheel_radius * front * arm / wheel_radius, wheel_speed * rear * arm
+            return force, force, torque, torque
+        force, torque = front * self.torque_limit / wheel_radius, rear * self.torque_limit
+        return -force, force, -torque, torque

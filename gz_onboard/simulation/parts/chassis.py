@@ -1,8 +1,8 @@
-"""What a turn does to the scooter, by one of the turning models: a part that can be replaced.
+"""Effect of a turn on the scooter, by one of the turning models: a part that can be replaced.
 
-`StraightChassis` knows no turn (Lord 2016, eqs. 3.1-3.7). `SteadyTurn` takes planar or leaning model (ch. 4) as a table
-of steady turns over speed and lateral acceleration, made once: a turn is long beside the 0.2 s in which lean and tyres
-settle, and following the lateral motion itself would make a ride ten times slower.
+`StraightChassis` ignores turns (Lord 2016, eqs. 3.1-3.7). `SteadyTurn` takes the planar or leaning model (ch. 4) as a
+table of steady turns over speed and lateral acceleration, made once: a turn lasts much longer than the 0.2 s in which
+lean and tyres settle, and following the lateral motion itself would make a ride ten times slower.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.turning.leaning import LEAN_TIME, Leaning
-from gz_onboard.simulation.turning.machine import Machine, MachineState, Road
+from gz_onboard.simulation.turning.machine import Machine, MachineState, RoadConditions
 from gz_onboard.simulation.turning.planar import Planar
 
 MODELS: dict[str, type[Planar] | None] = {"straight": None, "planar": Planar, "leaning": Leaning}
@@ -26,7 +26,7 @@ _SHARES = 40  # of the greatest lateral acceleration, evenly
 
 
 class Turn(NamedTuple):
-    """What a turn changes against riding straight on."""
+    """Changes by a turn, compared with riding straight on."""
 
     resistance: float  # force against the motion over the vehicle's weight, beyond drag and rolling when upright
     front_load: float  # load that it moves to the front axle, over the weight
@@ -39,7 +39,7 @@ STRAIGHT_ON = Turn(0.0, 0.0, 1.0, 1.0, 0.0)
 
 
 class Chassis(Protocol):
-    """What the scooter needs of a chassis."""
+    """A chassis, as the scooter uses it."""
 
     name: str
     beyond: float  # s in which the road turned harder than the model goes; its edge was taken
@@ -107,7 +107,7 @@ def chassis(name: str, parameters: Mapping[str, float]) -> Chassis:
 
 def _steady_turns(model: Planar, speed: float, limit: float) -> list[Turn]:
     """The steady turns at `speed` [m/s], held by the drive, from straight on to `limit` [m/s²], to the left."""
-    m, road = model.machine, Road()
+    m, road = model.machine, RoadConditions()
     weight = m.weight(road)
     drag, _ = m.resistance(speed, road)
     upright = m.rolling(speed) * weight
@@ -156,5 +156,5 @@ def steady_turn(model: Planar, speed: float, rate: float) -> tuple[MachineState,
 
 def _drift(model: Planar, state: MachineState, steer: float) -> tuple[float, float]:
     """Rates of lateral speed and yaw rate, whose zero is the steady turn."""
-    change = model.rates(state, steer, None, Road()).change
+    change = model.rates(state, steer, None, RoadConditions()).change
     return change[1], change[2]

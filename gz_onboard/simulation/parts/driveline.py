@@ -6,7 +6,7 @@ is exactly the change of kinetic energy.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.tyre import Tyre
@@ -15,56 +15,59 @@ BRAKE_PASSES = 4  # of front and rear brake in turn, where both hold; each leave
 FREELY = 0.5  # m/s: above it the front brake does all it can, for it stops nothing within a step
 
 
-class Acting(NamedTuple):
-    """What acts on wheel and vehicle in a step."""
-
-    torque: float  # N·m, that drives the wheel
-    resistance: float  # N, against the vehicle
-    rolling: float  # N, against the driven wheel
-    load: float  # N, on the driven tyre
-    radius: float  # m, of the wheel
-
-
-class Moved(NamedTuple):
-    """How wheel and vehicle moved in a step."""
-
-    speed_change: float  # m/s
-    wheel_change: float  # rad/s
-    force: float  # N, of the driven tyre
-    braking: float  # N·m, of the rear brake
-    front_braking: float  # N
-
-
+@dataclass
 class Driveline:
-    """The inertias [kg, kg·m²] that the driven tyre connects."""
+    """Vehicle and driven wheel, connected by the tyre."""
 
-    def __init__(self, moving_mass: float, wheel_inertia: float, front_wheel: bool) -> None:
-        self.moving_mass, self.wheel_inertia, self.front_wheel = moving_mass, wheel_inertia, front_wheel
+    tyre: Tyre
+    brakes: Brakes
+    moving_mass: float  # kg
+    wheel_inertia: float  # kg·m²
+    has_front_wheel: bool
 
     def kinetic_energy(self, speed: float, wheel_speed: float) -> float:
-        """Of vehicle and wheels [J] at these speeds [m/s, rad/s]."""
+        """Kinetic energy of vehicle and wheels [J] at these speeds [m/s, rad/s]."""
         return 0.5 * (self.moving_mass * speed**2 + self.wheel_inertia * wheel_speed**2)
 
-    def step(self, tyre: Tyre, brakes: Brakes, acting: Acting, v: float, w: float, brake: float, dt: float) -> Moved:
-        """One step of `dt` [s] from vehicle and wheel speeds `v` [m/s], `w` [rad/s]; brake: 0..1. Moves the slip on."""
-        drive, against, rolling, load, r = acting
-        base, gain = tyre.linear(r * w, v, dt)
-        mu, slope = tyre.friction(base + gain * (r * w - v))
+    def step(
+        self,
+        v: float,
+        w: float,
+        torque: float,
+        against: float,
+        rolling: float,
+        load: float,
+        r: float,
+        brake: float,
+        dt: float,
+    ) -> tuple[float, float, float, float, float]:
+        """Advance by `dt` [s] and update the tyre's slip.
+
+        v: speed of the vehicle [m/s]. w: of the driven wheel [rad/s]. torque: drives the wheel [N·m]. against, rolling:
+        forces [N] against the vehicle and against the driven wheel. load: on the driven tyre [N]. r: radius of the
+        wheel [m]. brake: command, 0..1. Returns the change of both speeds, the force of the driven tyre [N], the
+        torque of the rear brake [N·m] and the force of the front brake [N].
+        """
+        tyre = self.tyre
+        base, gain, mu, slope = tyre.grip(r * w, v, dt)
         grip, stiffness = load * mu, load * (slope if slope > 0.0 else 0.0) * gain
         m, j = self.moving_mass / dt, self.wheel_inertia / dt
         det = m * j + stiffness * (m * r * r + j)
         f1 = grip - against
-        f2 = drive - r * (grip + rolling)
+        f2 = torque - r * (grip + rolling)
         braking = front_braking = 0.0
         if brake > 0.0:
-            # How much each slows what it is on and what is on the other side of the tyre.
+            # How much each slows its own side and the other side of the tyre.
             by_torque, by_force, across = (m + stiffness) / det, (j + r * r * stiffness) / det, r * stiffness / det
+            front_least, front_most, rear_least, rear_most = self.brakes.bounds(brake, v, w, r)
             for _ in range(BRAKE_PASSES):
-                if self.front_wheel:
+                if self.has_front_wheel:
                     to_stop = (v + by_force * f1 + across * (f2 - braking)) / by_force
-                    front_braking = brakes.front_force(brake, v, r, to_stop)
+                    limited = front_most if to_stop > front_most else to_stop
+                    front_braking = front_least if limited < front_least else limited
                 to_stop = (w + by_torque * f2 + across * (f1 - front_braking)) / by_torque
-                braking = brakes.torque(brake, w, to_stop)
+                limited = rear_most if to_stop > rear_most else to_stop
+                braking = rear_least if limited < rear_least else limited
                 if v > FREELY:
                     break
             f1 -= front_braking
@@ -72,4 +75,4 @@ class Driveline:
         dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
         dv = ((j + r * r * stiffness) * f1 + r * stiffness * f2) / det
         tyre.slip = base + gain * (r * (w + dw) - v - dv)
-        return Moved(dv, dw, grip + stiffness * (r * dw - dv), braking, front_braking)
+        return dv, dw, grip + stiffness * (r * dw - dv), braking, front_braking

@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Protocol
 
-from gz_onboard.physics.model import Bound
+from gz_onboard.physics.model import Bound, stepper
 
 Quantities = MutableMapping[str, float]
 Ledger = MutableMapping[str, float]
 """Energy [J] by name; what is not in it yet is 0."""
 
 
-Call = tuple[str, Callable[[Mapping[str, float]], float]]
-"""An effect's name and its value as a function of the quantities, called once each step."""
-
-
 class Losses:
-    """The effects at one port, summed and booked a step of `dt` [s] at a time."""
+    """The effects at one port, summed and booked once each step of `dt` [s]."""
 
-    def __init__(self, calls: Sequence[Call], dt: float) -> None:
-        self._calls, self._dt = calls, dt
+    def __init__(self, effects: Sequence[Bound], dt: float) -> None:
+        self._names = [(i, bound.effect.name) for i, bound in enumerate(effects)]
+        self._values, self._dt = stepper(effects, dt), dt
 
     def total(self, quantities: Mapping[str, float], ledger: Ledger) -> float:
         """Their sum [W]; adds each [J] to `ledger` by its name."""
-        total = 0.0
-        for name, call in self._calls:
-            watts = call(quantities)
-            ledger[name] += watts * self._dt
-            total += watts
-        return total
+        values, dt = self._values(quantities), self._dt
+        for i, name in self._names:
+            ledger[name] += values[i] * dt
+        return sum(values)
 
 
 class Motor(Protocol):
-    """What the scooter needs of a motor."""
+    """A motor, as the scooter uses it."""
 
     torque_constant: float  # N·m/A (eq. 2.8)
     voltage_constant: float  # V·s/rad, line to line, RMS (eq. 2.7)
@@ -42,27 +37,26 @@ class Motor(Protocol):
         """Heat [W] at a shaft speed [rad/s], current [A] and temperature [degC]; books each loss of `dt` [s]."""
 
     def idle(self, speed: float, temperature: float) -> float:
-        """What it loses [W] turning without current: it is drag, which slows the shaft."""
+        """Loss [W] turning without current: drag, which slows the shaft."""
 
 
 class EffectMotor:
-    """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists.
+    """A motor whose losses are effects of the vehicle's model: copper, iron, and others that its file lists.
 
-    booked: their sum a step at a time; settled: what they settle at.
-    quantities: what the effects read.
+    quantities: read by the effects.
     """
 
     def __init__(
         self,
-        booked: Losses,
-        settled: Sequence[Bound],
+        effects: Sequence[Bound],
+        dt: float,
         torque_constant: float,
         voltage_constant: float,
         quantities: Quantities,
     ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
-        self._booked, self._settled = booked, [effect.term for effect in settled]
+        self._losses, self._settled = Losses(effects, dt), stepper(effects, None)
         self._q = quantities
 
     def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
@@ -70,14 +64,11 @@ class EffectMotor:
         q = self._q
         q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
         q["torque"] = self.torque_constant * current
-        return self._booked.total(q, ledger)
+        return self._losses.total(q, ledger)
 
     def idle(self, speed: float, temperature: float) -> float:
         """See `Motor`; not a step for an effect with memory."""
         q = self._q
         q["motor_speed"], q["motor_temperature"] = speed, temperature
         q["motor_current"] = q["torque"] = 0.0
-        total = 0.0
-        for term in self._settled:
-            total += term(q)
-        return total
+        return sum(self._settled(q))

@@ -1,4 +1,4 @@
-"""What the scooter stands on: a road, or the roller of a chassis dynamometer."""
+"""The road under the scooter, or the roller of a chassis dynamometer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.functions import direction
 
 Place = tuple[float, float, float]
 """(grade as the sine of the road's angle, curvature [1/m] positive to the left, headwind [m/s])."""

@@ -2,7 +2,7 @@
 
 Two forms of slip. ``steady`` is the printed one, κ = (V_t - V)/max(V, V_t, ε). ``transient``, the default, lets the
 carcass take up the slip over a relaxation length, σ·dκ/dt = V_t - V - |V|·κ (Pacejka 2012, eq. 7.9): the same at
-speed, and at standstill a spring instead of a singularity, so that a braked scooter stands on a hill.
+speed, and at standstill a spring instead of a singularity, so that a braked scooter holds on a hill.
 """
 
 from __future__ import annotations
@@ -43,3 +43,9 @@ class Tyre:
             return 0.0, 1 / scale
         decay = 1 / (1 + dt * abs(speed) / self.relaxation_length)
         return self.slip * decay, dt / self.relaxation_length * decay
+
+    def grip(self, rim: float, speed: float, dt: float) -> tuple[float, float, float, float]:
+        """(base, gain) of `linear`, and (µ, dµ/dκ) of `friction` at the slip of unchanged speeds [m/s]."""
+        base, gain = self.linear(rim, speed, dt)
+        mu, slope = self.friction(base + gain * (rim - speed))
+        return base, gain, mu, slope

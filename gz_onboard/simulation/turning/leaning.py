@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from math import atan, cos, sin
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.simulation.turning.machine import MachineState, Rates, Road
+from gz_onboard.simulation.turning.machine import MachineState, Rates, RoadConditions
 from gz_onboard.simulation.turning.planar import Planar, Posture
 from gz_onboard.simulation.turning.tyre import front_camber, ground_steer, handlebar_of, lean_of, rolling_radius
 
@@ -55,7 +55,7 @@ class Leaning(Planar):
         """Handlebar angle [rad] for a steer angle at the ground."""
         return handlebar_of(steer, lean, self.machine.caster)
 
-    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: RoadConditions) -> Rates:
         """With the handlebar at `steer` [rad] and a force `drive` [N] (None: what holds the speed)."""
         rates = super().rates(state, steer, drive, road)
         return replace(rates, change=(*rates.change, self._lean_rate(state)))

@@ -18,7 +18,7 @@ STABLE = 2.0
 
 
 @dataclass(frozen=True)
-class Road:
+class RoadConditions:
     """Where the machine rides: grade (sine of the angle, along its heading), headwind [m/s], air density [kg/m³]."""
 
     grade: float = 0.0
@@ -91,7 +91,7 @@ class Machine:
             rolling_speed=p["rolling_resistance_speed"],
         )
 
-    def resistance(self, speed: float, road: Road) -> tuple[float, float]:
+    def resistance(self, speed: float, road: RoadConditions) -> tuple[float, float]:
         """(aerodynamic drag, weight along the road) [N], against the motion: eqs. 3.1, 3.2."""
         drag = aerodynamic_drag.term(speed, road.headwind, road.air_density, drag_area=self.drag_area)
         return float(drag), self.mass * GRAVITY * road.grade
@@ -108,7 +108,7 @@ class Machine:
             )
         )
 
-    def weight(self, road: Road) -> float:
+    def weight(self, road: RoadConditions) -> float:
         """Load on both axles [N]: eq. 3.5."""
         return self.mass * GRAVITY * sqrt(1 - road.grade * road.grade)
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, sin, sqrt
 
-from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, RoadConditions
 from gz_onboard.simulation.turning.tyre import LateralTyre
 
 STANDSTILL = 0.1  # m/s: below it what camber does fades, as rolling resistance does
@@ -77,7 +77,7 @@ class Planar:
         radius = self.posture(state, 0.0).radius
         return (m.mass * (u * u + v * v) + m.yaw_inertia * r * r + m.spin_inertia * (u / radius) ** 2) / 2
 
-    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: RoadConditions) -> Rates:
         """With `steer` [rad] at the ground and a force `drive` [N] of the rear wheel (None: what holds the speed)."""
         m = self.machine
         u, v, r, _, _, heading, slip_f, slip_r = state[:8]

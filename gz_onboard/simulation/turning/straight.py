@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, RoadConditions
 
 _NONE = "lateral_acceleration yaw_rate lean steer slip_front slip_rear side_front side_rear"
 
@@ -24,7 +24,7 @@ class Straight:
         m = self.machine
         return (m.mass + m.spin_inertia / m.wheel_radius**2) * state[0] ** 2 / 2
 
-    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: RoadConditions) -> Rates:
         """With a force `drive` [N] of the driven wheel (None: the one that holds the speed); `steer` does nothing."""
         m = self.machine
         speed = state[0]

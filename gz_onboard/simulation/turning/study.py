@@ -24,7 +24,7 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.offline.page import markdown_table
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, RED, new_figure, rule, save
 from gz_onboard.simulation.turning.leaning import Leaning
-from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road, step
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, RoadConditions, step
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.simulation.turning.straight import Straight
 from gz_onboard.simulation.turning.tyre import ideal_of
@@ -80,7 +80,7 @@ class Steerer:
     integral and the time [s] are the last two entries of the state: the rider is integrated with the machine.
     """
 
-    def __init__(self, chassis: ChassisModel, roll: float, road: Road) -> None:
+    def __init__(self, chassis: ChassisModel, roll: float, road: RoadConditions) -> None:
         self.chassis, self.road = chassis, road
         machine = chassis.machine
         self.turn = -GRAVITY * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
@@ -110,7 +110,7 @@ class Steerer:
 
 def coast_down(chassis: ChassisModel, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
     """Lean to `roll` [rad] at `FAST`, let go, and record until `slow` [m/s] (at most 10 minutes)."""
-    rider = Steerer(chassis, roll, Road())
+    rider = Steerer(chassis, roll, RoadConditions())
     state = rider.start(FAST)
     for _ in range(round(LEAD_IN / dt)):
         state, _ = step(rider.rates, state, dt)

@@ -80,9 +80,9 @@ def test_a_shift_of_another_cell_goes_with_its_curve(tmp_path):
     shift = Curve({"temperature": np.array([0.0, 25.0])}, np.array([-0.02, 0.0]), np.full(2, 0.005), "V", "old cell")
     base = tmp_path / "base.toml"
     write_vehicle(REFERENCE, [Result("t", curves={"battery.rest_shift": shift})], base)
-    assert read_vehicle(base).pack.rest_shift_value
+    assert read_vehicle(base).pack.rest_shift_curve
     write_vehicle(base, for_file([ocv.calibrate(slow_test()[0])], read_vehicle(base)), base)
-    assert not read_vehicle(base).pack.rest_shift_value
+    assert not read_vehicle(base).pack.rest_shift_curve
 
 
 FALLING = Curve({"soc": np.linspace(0, 1, 3)}, np.array([3.0, 3.14196, 3.141961]), np.full(3, 0.01), "V", "x")

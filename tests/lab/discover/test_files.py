@@ -21,7 +21,7 @@ from gz_onboard.lab.discover.extension import MODELLED, curve_text, write_model
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.prior import LOG_SCALED
-from gz_onboard.lab.discover.result import Cause, Estimate, Gain, Isolability, Report, Unknown
+from gz_onboard.lab.discover.result import FoundCause, Gain, Isolability, ParameterEstimate, Report, Unknown
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
@@ -44,24 +44,28 @@ def lines(mixed: MixedModel) -> list[LinearRide]:
     return linearise_all([mixed.ride(read_samples(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
 
 
-def report(mixed: MixedModel, lines: list[LinearRide], *causes: Cause, unknown: Unknown | None = None) -> Discovery:
+def report(
+    mixed: MixedModel, lines: list[LinearRide], *causes: FoundCause, unknown: Unknown | None = None
+) -> Discovery:
     verdict = "unknown" if unknown else "cause"
     isolability = Isolability({}, [], [])
     plain = Report(verdict, list(causes), [], unknown, [], {}, Gain(), [], [], isolability, 15.0)
     return Discovery(plain, mixed, np.zeros(len(mixed.names)), lines, [])
 
 
-def cornering(share: float = 0.04) -> Cause:
-    return Cause("cornering_drag", "cornering_compliance", 0.25, "rad", (0.2, 0.3), 0.25, share, 70.0)
+def cornering(share: float = 0.04) -> FoundCause:
+    return FoundCause("cornering_drag", "cornering_compliance", 0.25, "rad", (0.2, 0.3), 0.25, share, 70.0)
 
 
-def rolling() -> Cause:
-    return Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.0033, 0.1, 50.0)
+def rolling() -> FoundCause:
+    return FoundCause(
+        "rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.0033, 0.1, 50.0
+    )
 
 
-def wind() -> Cause:
-    others = {"wind_east": Estimate(-1.0, (-2.0, 0.0))}
-    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, parameters=others)
+def wind() -> FoundCause:
+    others = {"wind_east": ParameterEstimate(-1.0, (-2.0, 0.0))}
+    return FoundCause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, parameters=others)
 
 
 def test_causes_become_effects_and_parameters(mixed, lines, tmp_path: Path):
@@ -115,7 +119,7 @@ def test_what_came_on_top_of_healthy_rides_does_not(mixed, lines, tmp_path: Path
 
 def test_a_sensors_error_is_no_energy(mixed, lines, tmp_path: Path):
     out = tmp_path / "new.toml"
-    gain = Cause("current_sensor_gain", "pack_current_gain", 1.03, "1", (1.02, 1.04), 0.02, 0.02, 50.0)
+    gain = FoundCause("current_sensor_gain", "pack_current_gain", 1.03, "1", (1.02, 1.04), 0.02, 0.02, 50.0)
     write_model(report(mixed, lines, gain), mixed.vehicle, REFERENCE, out)
     assert read_vehicle(str(out)).riding == mixed.vehicle.riding
 
@@ -141,7 +145,7 @@ def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantit
     at, values, _ = np.array(knots).T
     expected = hat_functions(x, at, quantity == "heading") @ values
     fast = {"speed": x if quantity == "speed" else np.full(len(x), 30.0)}
-    reads = {q: fast["speed"] if q == "speed" else x for q in effect.quantities}
+    reads = {q: fast["speed"] if q == "speed" else x for q in effect.term.quantities}
     fade = fast["speed"] ** 2 / (fast["speed"] ** 2 + 1)
     assert Bound(effect, scale)(reads) == pytest.approx(expected * fade, abs=1e-4)
     one = {q: float(v[7]) for q, v in reads.items()}  # on board: floats
@@ -167,7 +171,7 @@ def test_effects_of_the_users_own_go_along(mixed, lines, tmp_path: Path):
     there = tmp_path / "there"
     there.mkdir()
     known = initial(mixed.vehicle, own)
-    box = Cause("top_box", "box_area", 0.06, "m²", (0.05, 0.07), 0.06, 0.03, 30.0)
+    box = FoundCause("top_box", "box_area", 0.06, "m²", (0.05, 0.07), 0.06, 0.03, 30.0)
     found = report(known, linearise_all([line.ride for line in lines], known), box, unknown=CURVE)
     write_model(found, mixed.vehicle, REFERENCE, there / "new.toml")
     (own / "top_box.py").unlink()  # what was written stands alone
@@ -258,7 +262,7 @@ def test_the_extended_model_is_calibrated_about_what_was_found(learned: MixedMod
     base, out = tmp_path / "base.toml", tmp_path / "there" / "new.toml"
     out.parent.mkdir()
     write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, base)
-    growth = Cause("resistance_growth", "cell_resistance_factor", 1.4, "1", (1.2, 1.6), 0.4, 0.0, 70.0)
+    growth = FoundCause("resistance_growth", "cell_resistance_factor", 1.4, "1", (1.2, 1.6), 0.4, 0.0, 70.0)
     write_model(report(learned, lines, cornering(), growth), read_vehicle(str(base)), base, out)
     before, after = restore(read_vehicle(str(base))), restore(read_vehicle(str(out)))
     assert after.healthy == 7 and after.inflation == before.inflation and after.noise == before.noise

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, KNOTS, curve_forms
 from gz_onboard.lab.discover.grid import LONGEST, since, suspension_speed, vibration
-from gz_onboard.physics.vibration import FAST, SLOW, Vibration
+from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, Vibration
 
 RATE = 100.0
 
@@ -23,16 +23,16 @@ def settled(values: np.ndarray, rate: float = RATE) -> float:
 
 @given(level=st.floats(-20, 20), slope=st.floats(-2, 2))
 def test_what_is_slow_is_no_vibration(level: float, slope: float):
-    """A hill, a bend, a mounting angle: a ramp of `slope` lags by slope·FAST."""
+    """A hill, a bend, a mounting angle: a ramp of `slope` lags by slope times the time constant."""
     time = np.arange(0, 20, 1 / RATE)
-    assert settled(level + slope * time) <= 1.05 * abs(slope) * FAST + 1e-9
+    assert settled(level + slope * time) <= 1.05 * abs(slope) * VIBRATION_PERIOD_S + 1e-9
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
 def test_the_rms_of_a_vibration_hardly_depends_on_the_rate(rate: float):
-    """Of a sine at 8 Hz the high pass of time constant FAST keeps 1/√(1 + 1/(2π·8·FAST)²)."""
-    time = np.arange(0, 6 * SLOW, 1 / rate)
-    kept = 1 / np.sqrt(1 + 1 / (2 * np.pi * 8 * FAST) ** 2)
+    """A high pass of time constant τ keeps 1/√(1 + 1/(2π·8·τ)²) of a sine at 8 Hz."""
+    time = np.arange(0, 6 * VIBRATION_MEMORY_S, 1 / rate)
+    kept = 1 / np.sqrt(1 + 1 / (2 * np.pi * 8 * VIBRATION_PERIOD_S) ** 2)
     assert settled(9.81 + 2 * np.sin(2 * np.pi * 8 * time), rate) == pytest.approx(2 / np.sqrt(2) * kept, rel=0.12)
 
 

@@ -34,7 +34,17 @@ from gz_onboard.lab.discover.grid import since_change
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.page import body, write_report
-from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Split, Unknown
+from gz_onboard.lab.discover.result import (
+    Errors,
+    FoundCause,
+    Gain,
+    Isolability,
+    Report,
+    ResidualSize,
+    Score,
+    Split,
+    Unknown,
+)
 from gz_onboard.lab.discover.summary import summary
 from gz_onboard.lab.discover.uncalibrated import prior_of_file
 from gz_onboard.lab.discover.verdict import Discovery
@@ -90,7 +100,9 @@ def found(samples: Samples) -> Discovery:
 def reported(mixed: MixedModel, samples: Samples) -> Discovery:
     mixed = replace(mixed, prior=prior_of_file(mixed))
     lines = linearise_all([mixed.ride(samples)], mixed)
-    cause = Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0)
+    cause = FoundCause(
+        "rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0
+    )
     knots = tuple((float(v), float(v - 5), 0.5) for v in range(0, 16, 3))
     unknown = Unknown("road_force", "speed", False, "m/s", 40.0, 40.0, knots, share=0.03)
     ranking = [Score(c.name, 1.0) for c in mixed.causes]
@@ -215,7 +227,7 @@ def test_what_is_missed_on_rides_held_out_is_judged(found: Discovery, of_range: 
 
 
 def test_a_change_has_its_unit_and_what_differs_from_ride_to_ride_is_said(found: Discovery):
-    load = Cause("auxiliary_load", "auxiliary_power", 58.7, "W", (57.0, 60.0), 15.1, 0.02, 99.0, varies=True)
+    load = FoundCause("auxiliary_load", "auxiliary_power", 58.7, "W", (57.0, 60.0), 15.1, 0.02, 99.0, varies=True)
     ratios = {"ride a": (-0.93, 5.6), "ride b": (0.6, 2.1), "ride c": (0.5, 1.6), "time": (0.9, 12.0)}
     splits = [Split("auxiliary_load", name, *row) for name, row in ratios.items()]
     ranking = [Score("capacity_fade", 74.8), Score("auxiliary_load", 99.0), Score("headwind", 14.96)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root
 
-from gz_onboard.simulation.turning.machine import Rates, Road, step
+from gz_onboard.simulation.turning.machine import Rates, RoadConditions, step
 from gz_onboard.simulation.turning.study import STEP, ChassisModel, Steerer
 
 G = 9.80665
@@ -114,7 +114,7 @@ def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, fu
 
 def held(chassis: ChassisModel, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
     """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
-    rider = Steerer(chassis, roll, Road())
+    rider = Steerer(chassis, roll, RoadConditions())
     state = rider.start(speed)
     for _ in range(round(seconds / dt)):
         state, _ = step(rider.rates, state, dt)

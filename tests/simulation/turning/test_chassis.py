@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.physics.effects import cornering_drag
 from gz_onboard.simulation.turning.leaning import Leaning
-from gz_onboard.simulation.turning.machine import Road, step
+from gz_onboard.simulation.turning.machine import RoadConditions, step
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.simulation.turning.straight import Straight
 from gz_onboard.simulation.turning.study import coast_down
@@ -44,7 +44,7 @@ def ride(chassis, state, steer, drive, road, seconds, dt=0.005):
 )
 def test_energy_closes(machine, kind, speed, bend, drive, grade, wind):
     chassis = kind(machine)
-    road = Road(grade, wind)
+    road = RoadConditions(grade, wind)
     start = chassis.start(speed)
     steer = bend * G * machine.wheelbase / speed**2  # at most 0.3 g, if the speed were to stay
     end, energy = ride(chassis, start, steer, drive, road, 1.5)
@@ -74,7 +74,7 @@ def test_without_roll_all_are_the_straight_model(machine, kind):
 @pytest.mark.parametrize("drive", [0.0, 150.0, -300.0, None])
 def test_loads_pitch_as_in_the_straight_model(machine, drive):
     """Eqs. 3.5 to 3.7, on a hill and against wind: the planar model solves them with its tyres."""
-    road = Road(0.08, 4.0)
+    road = RoadConditions(0.08, 4.0)
     straight = Straight(machine).rates(Straight(machine).start(9.0), 0.0, drive, road).seen
     for kind in (Planar, Leaning):
         seen = kind(machine).rates(kind(machine).start(9.0), 0.0, drive, road).seen
@@ -82,7 +82,7 @@ def test_loads_pitch_as_in_the_straight_model(machine, drive):
             assert seen[name] == pytest.approx(straight[name], rel=1e-12)
     weight = machine.mass * G * (1 - 0.08**2) ** 0.5
     assert straight["load_front"] + straight["load_rear"] == pytest.approx(weight)
-    drag = 0.5 * Road().air_density * machine.drag_area * 13**2
+    drag = 0.5 * RoadConditions().air_density * machine.drag_area * 13**2
     push = machine.mass * (straight["acceleration"] + 0.08 * G) + drag
     rear = (weight * (machine.wheelbase - machine.cg_to_rear) + push * machine.cg_height) / machine.wheelbase
     assert straight["load_rear"] == pytest.approx(rear)
@@ -113,7 +113,7 @@ def test_fast_it_stays_finite_at_ten_milliseconds(machine, kind, speed):
     """Slip settles within the relaxation length: in 2 ms at 80 m/s, faster than a step of 10 ms can follow."""
     chassis = kind(replace(machine, drag_area=0.0))  # whose moment would lift the front wheel
     steer = 0.3 * G * machine.wheelbase / speed**2
-    coarse, fine = (ride(chassis, chassis.start(speed), steer, None, Road(), 2.0, dt) for dt in (0.01, 0.001))
+    coarse, fine = (ride(chassis, chassis.start(speed), steer, None, RoadConditions(), 2.0, dt) for dt in (0.01, 0.001))
     assert all(isfinite(value) for value in coarse[0])
     assert coarse[0][2] == pytest.approx(fine[0][2], rel=1e-3)
     assert 0.1 * G < coarse[0][2] * speed < 1.2 * G  # it turns, no harder than its tyres hold
@@ -124,7 +124,7 @@ def test_runge_kutta_converges_with_the_fourth_power(machine):
     chassis = Leaning(machine)
     start = chassis.start(10.0)
     steps = (0.02, 0.01, 0.0025)
-    ends = [ride(chassis, start, 0.02, -20.0, Road(), 1.0, dt)[0] for dt in steps]
+    ends = [ride(chassis, start, 0.02, -20.0, RoadConditions(), 1.0, dt)[0] for dt in steps]
     errors = [max(abs(x - y) for x, y in zip(end, ends[-1], strict=True)) for end in ends[:2]]
     assert errors[0] / errors[1] > 10
 
@@ -195,7 +195,7 @@ def test_comes_to_rest_without_chatter(machine, kind, steer):
     state = chassis.start(3.0)
     for _ in range(6000):
         braking = -300.0 * min(1.0, max(-1.0, state[0] / 0.2))
-        state, _ = step(partial(chassis.rates, steer=steer, drive=braking, road=Road()), state, 0.005)
+        state, _ = step(partial(chassis.rates, steer=steer, drive=braking, road=RoadConditions()), state, 0.005)
         assert all(isfinite(value) for value in state)
     assert abs(state[0]) < 1e-6
     if kind is not Straight:
@@ -205,7 +205,7 @@ def test_comes_to_rest_without_chatter(machine, kind, steer):
 
 @pytest.mark.parametrize("kind", [Planar, Leaning])
 def test_starts_from_standstill_with_the_steering_turned(machine, kind):
-    state, energy = ride(kind(machine), kind(machine).start(0.0), 0.2, 100.0, Road(), 5.0)
+    state, energy = ride(kind(machine), kind(machine).start(0.0), 0.2, 100.0, RoadConditions(), 5.0)
     assert state[0] > 1
     assert state[2] > 0  # to the left, where it steers
     assert all(isfinite(value) for value in (*state, *energy.values()))
@@ -213,9 +213,9 @@ def test_starts_from_standstill_with_the_steering_turned(machine, kind):
 
 def test_path_is_a_circle_in_a_steady_turn(machine):
     chassis = Planar(machine)
-    state, _ = ride(chassis, chassis.start(6.0), 0.1, None, Road(), 5.0)
+    state, _ = ride(chassis, chassis.start(6.0), 0.1, None, RoadConditions(), 5.0)
     rate, speed = state[2], (state[0] ** 2 + state[1] ** 2) ** 0.5
-    after, _ = ride(chassis, state, 0.1, None, Road(), 3.14159265358979 / rate)
+    after, _ = ride(chassis, state, 0.1, None, RoadConditions(), 3.14159265358979 / rate)
     across = ((after[3] - state[3]) ** 2 + (after[4] - state[4]) ** 2) ** 0.5
     assert across == pytest.approx(2 * speed / rate, rel=2e-3)
 
@@ -223,7 +223,7 @@ def test_path_is_a_circle_in_a_steady_turn(machine):
 @pytest.mark.parametrize("drive", [0.0, 200.0, None])
 def test_loads_in_a_turn_balance_pitch(machine, drive):
     """Eq. 3.7 with what the ground pushes along the machine, m·(du/dt - v·r) and the drag, side forces included."""
-    chassis, road = Planar(machine), Road(0.05, 2.0)
+    chassis, road = Planar(machine), RoadConditions(0.05, 2.0)
     state = (9.0, 0.2, 0.6, 0.0, 0.0, 0.0, 0.06, 0.04)
     rates = chassis.rates(state, 0.35, drive, road)
     drag, slope = machine.resistance(9.0, road)

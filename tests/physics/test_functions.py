@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.relaxation import decay_over, mean_response, relaxation, relaxed
+from gz_onboard.physics.functions import decay_over, mean_response, relaxation, relaxed
 
 steps = st.lists(st.tuples(st.floats(-5, 5), st.floats(0, 1)), min_size=1, max_size=30)
 

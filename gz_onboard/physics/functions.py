@@ -1,26 +1,101 @@
-"""Tables and how they are read between their points, one value or a whole ride at a time.
+"""Functions that effects, battery and controller are written with, of floats and of numpy arrays alike.
 
-Each form stands twice, for floats (`bisect`, on board: no numpy) and for arrays; a property test holds the two equal.
-Linear between the points; beyond the ends the edge counts (`linear`, `Mesh`), or the last slope goes on (`extended`).
-The circuit of a cell is geometric over temperature, linear in the logarithm: resistances fall nearly exponentially with
-it (Arrhenius), and a straight line between two temperatures is a tenth too high where they are 20 K apart.
+Elementary functions, the first-order lag, and tables. numpy is imported only where an array comes; on board all is
+floats. Tables are straight between their points. The circuit of a cell is geometric over temperature, straight in the
+logarithm: resistances fall nearly exponentially with it (Arrhenius), and a straight line between two temperatures is a
+tenth too high where they are 20 K apart.
 """
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
+T = TypeVar("T")
 Row = tuple[float, ...]
+NUMBER = float, int  # a tuple: a union would be built again at each call, which takes longer than the function
+STANDSTILL = 0.1  # m/s, or rad/s of a shaft: below it friction fades, so that nothing jumps where the sign changes
+NEGLIGIBLE = 1e-20  # share of a value that is too small to change it in floating point
+
+
+def _function(of_float: Callable[[float], float], name: str) -> Callable[[Any], Any]:
+    """`of_float` for numbers, numpy's function `name` for arrays."""
+
+    def function(x: Any) -> Any:
+        if isinstance(x, NUMBER):
+            return of_float(x)
+        import numpy as np
+
+        return getattr(np, name)(x)
+
+    return function
+
+
+exp = _function(math.exp, "exp")
+sin = _function(math.sin, "sin")  # of rad
+cos = _function(math.cos, "cos")  # of rad
+sqrt = _function(math.sqrt, "sqrt")
+asinh = _function(math.asinh, "arcsinh")
+
+
+def direction(speed: Any) -> Any:
+    """The sign of `speed` [m/s or rad/s], smooth around standstill: friction acts in proportion to it."""
+    return speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
+
+
+# --- first-order lag, dx/dt = (target - x)/τ: an RC pair (target R·I: Lord 2016, eq. 2.22), an effect with memory ---
+
+
+def decay_over(dt: float, time_constant: float) -> float:
+    """The factor by which the distance from the target shrinks in `dt` [s]; `time_constant` in s."""
+    return math.exp(-dt / time_constant)
+
+
+def relaxed(x: T, target: T, decay: T) -> T:
+    """`x` after a step over which it decays by `decay` towards a constant `target`; exact."""
+    return decay * x + (1 - decay) * target  # type: ignore[operator,no-any-return]
+
+
+def relaxation(targets: Array, decays: Array, start: float = 0.0, before: bool = False) -> Array:
+    """The values (n,) at the ends of all steps from `start` on; targets, decays: (n,).
+
+    before: the values at the beginnings of the steps instead. The remainder of earlier steps is carried over 1, 2, 4,
+    ... steps in whole arrays (Hillis & Steele 1986).
+    """
+    import numpy as np
+
+    values, left, steps = (1 - decays) * targets, decays.copy(), 1
+    values[:1] += decays[:1] * start
+    while steps < len(values) and left[steps:].max() > NEGLIGIBLE:
+        values[steps:] += left[steps:] * values[:-steps]
+        left[steps:] *= left[:-steps]
+        steps *= 2
+    return np.concatenate(([start], values[:-1])) if before else values
+
+
+def mean_response(decay: float) -> float:
+    """The mean of a lag's response over a constant load, as a share of the settled value: 1 - τ/T·(1 - exp(-T/τ)).
+
+    decay: exp(-T/τ), over the load's duration T.
+    """
+    if decay >= 1:
+        return 0.0
+    return 1 + (1 - decay) / math.log(decay) if decay > 0 else 1.0
+
+
+# --- tables: each form for a float (`bisect`) and for arrays ---------------------------------------------------------
+
 KEPT_ROWS = 8  # temperatures whose row of a mesh is kept: a pack and a ride have few at a time
 
 
 def linear(xs: Row, ys: Row, x: float) -> float:
-    """The value at `x` between the points; constant beyond the ends."""
+    """The value at `x`: straight between the points, constant beyond the ends."""
     if x <= xs[0]:
         return ys[0]
     if x >= xs[-1]:
@@ -30,7 +105,7 @@ def linear(xs: Row, ys: Row, x: float) -> float:
 
 
 def extended(xs: Row, ys: Row, x: float) -> tuple[float, float]:
-    """(value, slope) at `x`; beyond the ends along the last slope."""
+    """(value, slope) at `x`: straight between the points, and on along the last slope beyond the ends."""
     i = bisect_right(xs, x, 1, len(xs) - 1) - 1
     slope = (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
     return ys[i] + slope * (x - xs[i]), slope
@@ -61,6 +136,24 @@ def bilinear_over(xs: Array, ys: Array, table: Array, x: Array, y: Array, geomet
     if geometric:
         left, right = np.exp(left), np.exp(right)
     return np.asarray(left * (1 - u) + right * u)
+
+
+@dataclass(frozen=True)
+class PiecewiseLinear:
+    """A quantity `y` over another, `x`: straight between its points, constant beyond the ends."""
+
+    x: Row
+    y: Row
+
+    def at(self, x: float) -> float:
+        """The value at `x`."""
+        return linear(self.x, self.y, x)
+
+    def over(self, x: Array) -> Array:
+        """The values at `x` (m,)."""
+        import numpy as np
+
+        return np.asarray(np.interp(x, self.x, self.y))
 
 
 @dataclass(frozen=True, eq=False)
