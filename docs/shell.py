@@ -88,7 +88,7 @@ def manual() -> str:
         lines += [f".SS {name}", plain(command.description or ""), ".PP", *literal(command.format_usage())]
         formatter = command._get_formatter()
         for action in command._actions:
-            if action.help and action.help != argparse.SUPPRESS and action.dest != "help":
+            if action.help and action.dest != "help":
                 lines += [".TP", f".B {plain(formatter._format_action_invocation(action))}"]
                 lines += [plain(formatter._expand_help(action))]
         lines += literal(command.epilog) if command.epilog else []

@@ -15,7 +15,8 @@ log = logging.getLogger("gz-onboard")
 class Background:
     """Makes calls one after the other on a separate thread; the caller never waits.
 
-    limit: how much may wait, in the weights that `call` is given. An exception is logged, and the next call is made.
+    limit: how much may wait, in the weights that `call` is given. An exception of a call is logged, and the next one
+    is made.
     """
 
     def __init__(self, name: str, limit: int = 1) -> None:

@@ -101,7 +101,7 @@ class _Parser(argparse.ArgumentParser):
         """Options of this command and of its subcommands."""
         options: list[str] = []
         for action in self._actions:
-            options += action.option_strings if action.help != argparse.SUPPRESS else []
+            options += action.option_strings
             if isinstance(action, argparse._SubParsersAction):
                 for parser in action.choices.values():
                     options += parser.known_options()

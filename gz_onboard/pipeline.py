@@ -162,7 +162,7 @@ class Pipeline:
     def _close_window(self, time_ns: int) -> None:
         """Make a step of the estimator and an estimate at the end of a window."""
         now = self.codec.seconds(time_ns)
-        self.estimator.step(now, self.codec.windows())
+        self.estimator.step(self.codec.windows())
         estimate = self.estimator.estimate(now)
         if self._recent or self.extra_reasons:
             estimate.reasons |= self._recent | self.extra_reasons

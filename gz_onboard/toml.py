@@ -70,9 +70,11 @@ class Table:
                 there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
                 raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
 
-    def table(self, key: str) -> Table:
-        """Return the sub-table `key`; an empty one if it is missing."""
+    def table(self, key: str, short: str = "") -> Table:
+        """Return the sub-table `key`; empty if it is missing. short: ``key = value`` is ``{ short = value }``."""
         value = self.values.get(key, {})
+        if short and not isinstance(value, Mapping):
+            value = {short: value}
         if not isinstance(value, Mapping):
             raise self.error(f"must be a table, is {shown(value)}", key)
         return Table(value, self.file, self._lines, _joined(self._path, key))
@@ -183,6 +185,8 @@ def _line_numbers(text: str) -> dict[str, int]:
                 lines.setdefault(path, number)
                 table = path = f"{path}.{counts[path]}"
                 counts[path.rpartition(".")[0]] += 1
+            elif array := next((array for array in counts if path.startswith(f"{array}.")), None):
+                table = path = f"{array}.{counts[array] - 1}{path[len(array) :]}"  # of the last table so far
         elif key := _KEY.match(line):
             path = _joined(table, _path(key[1]))
         else:

@@ -33,21 +33,21 @@ class EventEstimator(Estimator):
     def handle(self, event: Event) -> None:
         """Take an event, and make the step of the window before it."""
         if event[0] > self._end:
-            self.close(self._end)
+            self.close()
             self._end = event[0] + WINDOW - 1e-3
         self._open.setdefault(event[1], []).append(event)
 
-    def close(self, now: float) -> None:
+    def close(self) -> None:
         """Make a step with what came since the last."""
         windows = [self._window(group, events) for group, events in getattr(self, "_open", {}).items()]
         self._open = {}
-        self.step(now, windows)
+        self.step(windows)
 
     def estimate(self, now: float) -> Estimate:
         """See `Estimator`."""
         if getattr(self, "_open", None):
             self._end = min(now, self._end)
-            self.close(self._end)
+            self.close()
         return super().estimate(now)
 
     @staticmethod

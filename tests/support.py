@@ -13,10 +13,12 @@ from cantools.database.can import Database, Message
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.bus.logfile import LogFile
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.physics.effect import Port
 from gz_onboard.pipeline import TICK_NS, Pipeline
+from gz_onboard.recording.export import write_frames_as
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
@@ -33,6 +35,28 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def write_log(file: Path, frames: Sequence[Frame]) -> Path:
+    """A log of `frames` in the format of the file's name: MCAP and candump exactly, others by python-can."""
+    if file.suffix == ".mcap":
+        log = LogFile(file.open("wb"), frames[0][0])
+        log.frames(frames)
+        log.close()
+    elif file.suffix == ".log":
+        file.write_text("".join(map(_candump_line, frames)))
+    else:
+        write_frames_as(file, file.suffix, [list(frames)])
+    return file
+
+
+def _candump_line(frame: Frame) -> str:
+    time_ns, identifier, data, channel = frame
+    wide = identifier & (EFF_FLAG | ERR_FLAG)
+    name = f"{identifier & (0x1FFF_FFFF | ERR_FLAG):0{8 if wide else 3}X}"
+    content = f"R{len(data) or ''}" if identifier & RTR_FLAG else "#0" * (len(data) > 8) + data.hex()
+    sent = " T" if channel & TRANSMITTED else ""
+    return f"({time_ns / 1e9:.6f}) can{channel & ~TRANSMITTED} {name}#{content}{sent}\n"
 
 
 def with_cell_voltages(folder: Path) -> Vehicle:

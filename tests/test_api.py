@@ -19,8 +19,7 @@ import pytest
 import gz_onboard as gz
 from gz_onboard import api, cli, state
 from gz_onboard.recording.logs import read_frames
-from gz_onboard.recording.writers import write_candump
-from tests.support import LOGS, ROOT
+from tests.support import LOGS, ROOT, write_log
 from tests.test_learned import CAPACITY, saved
 
 __all__ = ["saved"]  # a fixture
@@ -289,8 +288,7 @@ def test_samples_may_be_lists():
 def test_frames_that_overtake_each_other_by_a_little_are_a_ride(tmp_path):
     frames = [frame for batch in read_frames(COASTDOWN) for frame in batch][:4000]
     late = [(t - 40_000_000 * (n % 5 == 4), i, data, ch) for n, (t, i, data, ch) in enumerate(frames)]
-    with (tmp_path / "ride.log").open("w") as stream:
-        write_candump(stream, [late])
+    write_log(tmp_path / "ride.log", late)
     ride = gz.read_ride(tmp_path / "ride.log")
     assert min(np.diff(times).min() for times, _ in ride.columns.values()) < 0
 

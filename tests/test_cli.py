@@ -58,7 +58,6 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "--chanel=can0"], "did you mean '--channel'"),
         (["run", "--chan", "can0"], "did you mean '--channel'"),  # no abbreviations: they break when options are added
         (["history", "show", "--fromat", "svg"], "unrecognized arguments: --fromat svg\n"),  # only dashes in common
-        (["report", RIDE, "--format", "pdf"], "report: error: argument --format: the report is a page in HTML"),
         (["run", "--filter", "filterpi"], "did you mean 'filterpy'"),
         (["run", "--filter", "plt"], "choose from"),
         (["run", "--payload", "much"], "--payload: invalid float value: 'much'"),

@@ -31,7 +31,7 @@ from hypothesis import strategies as st
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.library_bus import LibraryBus
-from gz_onboard.bus.recorder import Limits, Recorder, is_complete
+from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary
 from gz_onboard.daemon.loop import Daemon, fair_share
@@ -195,7 +195,7 @@ def largest_file(size: int) -> Iterator[None]:
 
 
 def test_a_log_that_cannot_be_written_is_told_and_begun_again(bus: str, tmp_path: Path):
-    recorder = Recorder(tmp_path, "v", limits=Limits(sync_s=0.2, retry_s=0.5))
+    recorder = Recorder(tmp_path, "v", limits=LogLimits(sync_s=0.2, retry_s=0.5))
     with Scene(bus, recorder=recorder) as scene:
         with largest_file(8_000):
             failed: list[bool] = []  # that it was, once: half a second later it is tried again
@@ -668,7 +668,7 @@ def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, mo
         real[number](descriptor)
 
     file = tmp_path / "scooter.json"
-    recorder = Recorder(tmp_path / "log", "v", limits=Limits(sync_s=0.3))
+    recorder = Recorder(tmp_path / "log", "v", limits=LogLimits(sync_s=0.3))
     with Scene(bus, recorder=recorder, state_file=file) as scene:
         log = scene.daemon._log
         assert log is not None
@@ -790,7 +790,7 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
     channel = CanChannel("virtual", bus)
     channel.open()
     file = tmp_path / "scooter.json"
-    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", limits=Limits(sync_s=0.1)), file)
+    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", limits=LogLimits(sync_s=0.1)), file)
     frames = Scooter().steady(2.0)
     daemon.step(frames[: len(frames) // 2], frames[len(frames) // 2][0])
     daemon.step(frames[len(frames) // 2 :], frames[-1][0] + S)
@@ -815,7 +815,7 @@ def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
 ):
     channel = CanChannel("virtual", bus)
     channel.open()
-    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", limits=Limits(sync_s=1e6))
+    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", limits=LogLimits(sync_s=1e6))
     daemon = Daemon(reference(), [channel], recorder, file)
     frames = Scooter().steady(3.0)
     half = len(frames) // 2

@@ -1,4 +1,4 @@
-"""Shared options: ranges, old names, and what is a log."""
+"""Shared options: ranges and formats of logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""python-can, imported so that it stays small: use ``from gz_onboard.bus._can import can`` on board.
+"""Import python-can without asammdf: use ``from gz_onboard.bus._can import can`` on board.
 
 Where asammdf is installed, ``import can`` loads it for its MF4 reader, and with it pandas: 86 MB and 0.9 s that
 a daemon which never reads an MF4 file would pay at each start.
@@ -49,7 +49,7 @@ def check_interface(name: str) -> None:
 
 
 def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:
-    """python-can's bus; of `udp_multicast`, where the channel may be GROUP:PORT, with the frames of its group only.
+    """Open a bus of python-can. Of `udp_multicast` the channel may be GROUP:PORT, and only its group is heard.
 
     Linux gives a socket those of every group that any process of the machine has joined on its port.
     """

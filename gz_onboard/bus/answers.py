@@ -1,13 +1,11 @@
-"""The answers to requests, put together from the frames that carry them (ISO 15765-2), whoever asked.
+"""Assemble the answers to diagnostic requests from the frames that carry them (ISO 15765-2), whoever asked.
 
-It only listens and knows no clock, so a log gives what the live bus gave. An answer is whole or it is nothing: what
-comes out of order, late or mixed with another is dropped and counted.
+There is no clock, so a log gives the same answers as the live bus. An answer is complete or dropped and counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import Enum
 
 from gz_onboard.bus.requests import Request
 
@@ -20,103 +18,73 @@ NEGATIVE = "negative response"  # and its code
 NEGATIVE_RESPONSE = 0x7F
 PENDING = 0x78  # the answer comes later
 LONGEST_PAUSE = 1.0  # s between the frames of an answer: N_Cr of ISO 15765-2
-DOUBTED = 3  # answers are left out where one begins within another: whose are the frames that follow?
-_SINGLE, _FIRST, _FOLLOWING, _FLOW_CONTROL = range(4)
-_FRAME = 8  # bytes, of a frame that another follows
-
-
-class _State(Enum):
-    IDLE = 0
-    TAKING = 1
-    LEFT = 2  # what follows belongs to an answer that is dropped already, or began before we listened
+_SINGLE, _FIRST, _CONSECUTIVE, _FLOW_CONTROL = range(4)
 
 
 class Assembler:
-    """Puts the answers on one identifier together. address: the first byte of each frame, if it has one."""
+    """Assembles the answers on one identifier. address: the first byte of each frame, if it has one."""
 
     def __init__(self, address: int | None, fault: Callable[[str], None]) -> None:
         self._address = address
         self._fault = fault
-        self._state = _State.LEFT
         self._data = bytearray()
-        self._length = 0
+        self._length = 0  # of the answer that is being assembled; 0: none is
+        self._skips = True  # consecutive frames of an answer that was dropped, or started before we listened
         self._next = 0  # sequence number
-        self._time = -LONGEST_PAUSE  # s, of the last frame of an answer of several
-        self._doubt = 0  # answers of several frames still to be left out
+        self._time = 0.0  # s, of the last frame
 
     def take(self, time: float, data: bytes) -> bytes | None:
         """The answer that the frame `data` of `time` [s] completes, or None."""
-        whole = len(data) == _FRAME
+        is_full = len(data) == 8
         if self._address is not None:
             if data[:1] != bytes([self._address]):
                 return None  # to another tester
             data = data[1:]
-        kind = data[0] >> 4 if data and len(data) <= _FRAME else _FLOW_CONTROL + 1
-        if kind == _SINGLE:
-            return self._single(data)
-        if kind == _FIRST:
-            self._first(time, data, whole)
-        elif kind == _FOLLOWING:
-            return self._following(time, data, whole)
-        elif kind > _FLOW_CONTROL:
-            self._fault(MALFORMED)
-        return None
-
-    def _single(self, data: bytes) -> bytes | None:
-        length = data[0] & 0xF
-        if self._state is _State.TAKING:
-            self._fault(INTERRUPTED)
-        self._state = _State.IDLE
-        if 0 < length < len(data):
-            return data[1 : 1 + length]
-        self._fault(MALFORMED)
-        return None
-
-    def _first(self, time: float, data: bytes, whole: bool) -> None:
-        recent, self._time = 0 <= time - self._time < LONGEST_PAUSE, time
-        if self._state is _State.TAKING:
-            self._fault(INTERRUPTED)
-            self._doubt = DOUBTED
-        self._doubt = self._doubt if recent else 0
-        self._length = (data[0] & 0xF) << 8 | data[1] if len(data) > 1 else 0
-        self._state = _State.LEFT
-        if self._doubt:
-            self._doubt -= 1
-            self._fault(INTERRUPTED)
-        elif not whole or self._length < len(data):  # what fits into a single frame comes in one; 0: over 4095 bytes
-            self._fault(MALFORMED)
+        kind = data[0] >> 4 if data and len(data) <= 8 else None
+        if kind == _CONSECUTIVE:
+            return self._consecutive(time, data, is_full)
+        if kind == _FLOW_CONTROL:
+            return None
+        if is_interrupted := self._length > 0:
+            self._drop(INTERRUPTED)
+        if kind == _SINGLE and 0 < data[0] < len(data):
+            self._skips = False
+            return data[1 : 1 + data[0]]
+        if kind == _FIRST and is_interrupted:  # whose frames will follow? drop both
+            return None
+        length = (data[0] & 0xF) << 8 | data[1] if kind == _FIRST and is_full else 0
+        if length < len(data):  # a shorter answer comes in a single frame
+            self._drop(MALFORMED)
         else:
-            self._data[:] = data[2:]
-            self._state, self._next = _State.TAKING, 1
+            self._data, self._length, self._next, self._time, self._skips = bytearray(data[2:]), length, 1, time, False
+        return None
 
-    def _following(self, time: float, data: bytes, whole: bool) -> bytes | None:
-        recent, self._time = 0 <= time - self._time < LONGEST_PAUSE, time
-        if self._state is _State.LEFT:
+    def _consecutive(self, time: float, data: bytes, is_full: bool) -> bytes | None:
+        if self._skips:
             return None
         missing = self._length - len(self._data)
-        if (
-            self._state is _State.IDLE
-            or not recent
-            or data[0] & 0xF != self._next
-            or (len(data) - 1 < missing and not whole)
-        ):
-            self._fault(SEQUENCE)
-            self._state = _State.LEFT
+        in_time = 0 <= time - self._time < LONGEST_PAUSE
+        if not self._length or not in_time or data[0] & 0xF != self._next or (len(data) <= missing and not is_full):
+            self._drop(SEQUENCE)
             return None
         self._data += data[1 : 1 + missing]
-        self._next = self._next + 1 & 0xF
+        self._next, self._time = self._next + 1 & 0xF, time
         if len(self._data) < self._length:
             return None
-        self._state = _State.IDLE
+        self._length = 0
         return bytes(self._data)
+
+    def _drop(self, reason: str) -> None:
+        self._fault(reason)
+        self._length, self._skips = 0, True
 
 
 Take = Callable[[float, bytes], object]
 """Takes the time [s] and the bytes behind the data identifier."""
 
 
-class Answers:
-    """Those on one identifier: of `requests`, each taken by the one of `takers` at its place.
+class AnswerReader:
+    """Gives each answer on one identifier to the one of `takers` at the place of its request in `requests`.
 
     fault: counts (message, reason).
     """
@@ -124,24 +92,17 @@ class Answers:
     def __init__(self, requests: Sequence[Request], takers: Sequence[Take], fault: Callable[[str, str], None]) -> None:
         addresses, self._place = requests[0].addresses, f"{requests[0].response & 0x1FFFFFFF:#x}"
         self._fault = fault
-        self._assembler = Assembler(addresses[1] if addresses else None, self._dropped)
+        self._assembler = Assembler(addresses[1] if addresses else None, lambda reason: fault(self._place, reason))
         self._takers = {request.prefix: take for request, take in zip(requests, takers, strict=True)}
 
     def take(self, time: float, data: bytes) -> None:
         """Take the frame `data` of `time` [s]."""
-        payload = self._assembler.take(time, data)
-        if payload is None:
-            return
-        if payload[0] == NEGATIVE_RESPONSE:
-            if payload[2:3] and payload[2] != PENDING:
-                self._fault(self._place, f"{NEGATIVE} {payload[2]:#04x}")
-            return
+        payload = self._assembler.take(time, data) or b""
+        if payload[:1] == bytes([NEGATIVE_RESPONSE]) and payload[2:3] and payload[2] != PENDING:
+            self._fault(self._place, f"{NEGATIVE} {payload[2]:#04x}")
         for prefix, take in self._takers.items():
             if payload.startswith(prefix):
                 take(time, payload[len(prefix) :])
-
-    def _dropped(self, reason: str) -> None:
-        self._fault(self._place, reason)
 
 
 def by_response(requests: Sequence[Request]) -> dict[int, list[Request]]:

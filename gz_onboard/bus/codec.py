@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, Take, by_response
+from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, Take, by_response
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
@@ -431,7 +431,7 @@ class Codec:
         handlers: dict[int, Handler] = dict.fromkeys(asked, lambda _time, _data: True)
         for response, those in by_response(requests).items():
             takers = [self._answer(-1 - requests.index(one), by_message.get(one.name, [])) for one in those]
-            answers = Answers(those, takers, self._fault)
+            answers = AnswerReader(those, takers, self._fault)
             handlers[response] = lambda time, data, answers=answers: answers.take(time * 1e-9, data)  # type: ignore[misc]
         return handlers
 

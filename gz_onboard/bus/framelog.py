@@ -1,4 +1,4 @@
-"""Raw CAN frames in blocks: the binary form in which the log holds them, layout in docs/log-format.md.
+"""Encode raw CAN frames as the binary blocks of our log (layout: docs/log-format.md).
 
 Within a block the data bytes stand by kind of frame (same identifier, channel and length) and there by byte
 position, because a byte resembles the same byte of the frame before it far more than its neighbour: the same
@@ -9,8 +9,6 @@ to the nanosecond and the order of the frames is kept.
 from __future__ import annotations
 
 import struct
-import sys
-from array import array
 from collections.abc import Sequence
 from math import gcd
 from operator import sub
@@ -41,7 +39,6 @@ _KIND = struct.Struct("<IBB")
 _VERSION = 1
 _WIDTHS = {2: "h", 4: "i", 8: "q"}
 _MAX_KINDS = 0xFFFF
-_SWAP = sys.byteorder == "big"
 
 
 def encode_block(frames: Sequence[Frame]) -> bytes:
@@ -71,8 +68,8 @@ def encode_block(frames: Sequence[Frame]) -> bytes:
     head = _HEAD.pack(_VERSION, width, len(number), len(frames), times[0], unit)
     parts = [head]
     parts += [_KIND.pack(*key) for key in number]
-    parts.append(_little(array("B" if len(number) <= 256 else "H", order)).tobytes())
-    planes = _little(array(_WIDTHS[width], steps)).tobytes()
+    parts.append(struct.pack(f"<{len(order)}{'B' if len(number) <= 256 else 'H'}", *order))
+    planes = struct.pack(f"<{len(steps)}{_WIDTHS[width]}", *steps)
     parts += [planes[i::width] for i in range(width)]
 
     by_kind: list[list[bytes]] = [[] for _ in number]
@@ -82,10 +79,3 @@ def encode_block(frames: Sequence[Frame]) -> bytes:
         joined = b"".join(of_kind)
         parts += [joined[i::length] for i in range(length)]
     return b"".join(parts)
-
-
-def _little(values: array[int]) -> array[int]:
-    """The array itself on a little-endian machine; else with its bytes swapped: what is stored is little-endian."""
-    if _SWAP:
-        values.byteswap()
-    return values

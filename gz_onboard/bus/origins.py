@@ -1,8 +1,9 @@
-"""Where each message comes from: one channel and one sender, so that two meanings of one identifier are never mixed."""
+"""Take each message from one channel and one sender, so that two meanings of one identifier are never mixed."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.mapping import BusMapping, pgn
@@ -16,12 +17,22 @@ Place = tuple[int, int]
 RECENT = 8  # frames: a gateway's copy comes no later, and so many in a row must differ
 
 
+@dataclass(slots=True)
+class _Elsewhere:
+    """Frames of a message from another place than its own."""
+
+    own_frames: int  # of the message's own place, when the last of these came
+    unmatched: bytes | None = None  # the data of the last, if the own place has not sent the same
+    differing: int = 0  # in a row
+    is_copy: bool = False  # it sent the same while the own place did
+
+
 class Origins:
     """Finds the message of a frame and takes each message from one place only.
 
-    That is the place named by ``channel`` and ``sender`` in the vehicle file; else the sender in the DBC file, once it
-    is heard; else the first place heard. Identical frames from elsewhere are copies, as a gateway makes them; they take
-    over where the message's own place falls silent.
+    The place is named by ``channel`` and ``sender`` in the vehicle file; else it is the sender in the DBC file, once
+    heard; else the first place heard. Identical frames from elsewhere are copies, as a gateway makes them; they take
+    over when the own place falls silent.
     """
 
     def __init__(self, mapping: BusMapping) -> None:
@@ -30,13 +41,9 @@ class Origins:
         self._groups: dict[int, Message] = {}
         self._places: dict[str, Place] = {}
         self.recent: dict[str, deque[bytes]] = {}  # a message's own data, once it is heard elsewhere as well
-        self._sent: dict[str, int] = {}  # frames of the message's own place, by message, once it is heard elsewhere
-        self._pending: dict[
-            tuple[str, Place], tuple[int, bytes | None]
-        ] = {}  # their number at a frame, and its data if new
-        self._apart: dict[tuple[str, Place], int] = {}  # frames in a row
-        self._copies: set[tuple[str, Place]] = set()  # places that sent the same while the message's own did
-        self.conflicts: dict[str, str] = {}  # what differs and what to do, by message
+        self._sent: Counter[str] = Counter()  # frames of its own place, by message, once it is heard elsewhere
+        self._elsewhere: dict[tuple[str, Place], _Elsewhere] = {}
+        self.conflicts: dict[str, str] = {}  # the contradiction and its remedy, by message
         for message in mapping.database.messages:
             if mapping.j1939 and message.is_extended_frame:
                 self._groups[pgn(message.frame_id)] = message
@@ -60,12 +67,13 @@ class Origins:
     def own(self, name: str, data: bytes) -> None:
         """Note a frame of the message of this name from its own place, to compare others with."""
         self.recent[name].append(data)
-        self._sent[name] = self._sent.get(name, 0) + 1
+        self._sent[name] += 1
 
     def take_over(self, message: Message, channel: int, identifier: int) -> bool:
-        """Take `message` from here, if frames from here were copies of it; gives whether it is."""
+        """Take `message` from here if frames from here were copies of it; returns whether it is taken from here now."""
         place = self._place(message, channel, identifier)
-        if (message.name, place) in self._copies and message.name not in self.conflicts:
+        elsewhere = self._elsewhere.get((message.name, place))
+        if elsewhere and elsewhere.is_copy and message.name not in self.conflicts:
             self._places[message.name] = place
         return self._places.get(message.name) == place
 
@@ -74,22 +82,20 @@ class Origins:
         place, own = self._place(message, channel, identifier), self._places.get(message.name)
         if own is None or not self._may_be(message, place) or (self._is_in_dbc(message, own) and place[1] != own[1]):
             return False  # it is known which is meant
-        at, recent = (message.name, place), self.recent.setdefault(message.name, deque(maxlen=RECENT))
-        sent, pending = self._pending.get(at, (self._sent.get(message.name, 0), None))
-        now = self._sent.get(message.name, 0)
+        recent = self.recent.setdefault(message.name, deque(maxlen=RECENT))
+        sent = self._sent[message.name]
+        known = self._elsewhere.setdefault((message.name, place), _Elsewhere(sent))
         if silent:
-            self._apart[at] = self._apart.get(at, 0) + 1
+            known.differing += 1
         elif data in recent:
-            self._apart[at] = 0
-            if now > sent:
-                self._copies.add(at)
-        elif pending is not None and now > sent:
-            self._apart[at] = 0 if pending in recent else self._apart.get(at, 0) + 1
-        self._pending[at] = now, None if data in recent else data
-        if self._apart.get(at, 0) >= RECENT:
-            self.conflicts[message.name] = _conflict(
-                message, own, place, "one after the other" if silent else "with different data"
-            )
+            known.differing = 0
+            known.is_copy |= sent > known.own_frames
+        elif known.unmatched is not None and sent > known.own_frames:
+            known.differing = 0 if known.unmatched in recent else known.differing + 1
+        known.own_frames, known.unmatched = sent, None if data in recent else data
+        if known.differing >= RECENT:
+            how = "one after the other" if silent else "with different data"
+            self.conflicts[message.name] = _conflict(message, own, place, how)
         return message.name in self.conflicts
 
     def _place(self, message: Message, channel: int, identifier: int) -> Place:

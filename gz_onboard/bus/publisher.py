@@ -1,13 +1,14 @@
-"""From estimates to CAN frames: the range at 1 Hz, the status at 10 Hz.
+"""Encode estimates as CAN frames: the range at 1 Hz, the status at 10 Hz.
 
-By ``dbc/range.dbc``, or by another DBC file with messages and signals of the same names: other scales, identifiers and
-places. What is not known, and what a signal cannot say, is sent as not available, never as a number; only counts
-stay at their greatest.
+The layout comes from ``dbc/range.dbc``, or from another DBC file with messages and signals of the same names but other
+scales, identifiers and places. An unknown value, or one that its signal cannot hold, is sent as not available, never
+as a number; counts stop at their maximum.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,7 +45,7 @@ _NUMBERED = re.compile(rb"\b(BO_|SG_|VAL_|BO_TX_BU_|SIG_GROUP_|SIG_VALTYPE_) (\d
 
 @dataclass(frozen=True)
 class Counts:
-    """What the daemon counted since its start."""
+    """Frames that the daemon counted since its start."""
 
     dropped: int = 0
     implausible: int = 0
@@ -53,48 +54,46 @@ class Counts:
 
 
 class Publisher:
-    """Encodes estimates by a DBC file, `dbc/range.dbc` if none is given; its state is the counters of its messages.
+    """Encodes estimates by a DBC file, by default `dbc/range.dbc`; its state is the counters of its messages.
 
-    identifier: of the first message, without flags, in place of the file's own; the others follow by `step`.
-    InputError if the file does not hold what is to be sent.
+    identifier: of the first message, without flags, in place of that in the file; the others follow by `step`.
+    InputError if a message or signal is missing in the file or cannot be sent.
     """
 
     def __init__(self, file: Path | None = None, identifier: int | None = None, step: int = 1) -> None:
         self.file = file or find_dbc(RANGE_DBC)
         self.messages = range_messages(self.file)
-        self._counters = dict.fromkeys(self.messages, 0)
-        self._layouts: dict[str, _Layout] = {}
+        self._encoders: dict[str, _Encoder] = {}
         for i, (name, message) in enumerate(self.messages.items()):
-            own = identifier_of(message) if identifier is None else with_flag(identifier + i * step)
-            self._layouts[name] = _layout(message, own)
-        self._fields = {field.name: field for layout in self._layouts.values() for field in layout.fields}
-        status = self._layouts["RANGE_Status"].fields
-        self._reason_fields = [(int(reason), self._fields[reason_signal(reason)]) for reason in Reason]
-        status[:] = [field for field in status if all(field is not other for _, other in self._reason_fields)]
-        self._reasons = 0, 0  # the last ones sent, and their bits at their places
-        self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in self._fields]
+            first = identifier_of(message) if identifier is None else identifier + i * step
+            self._encoders[name] = _encoder(message, first | EFF_FLAG if first > MOST_STANDARD else first)
+        self._fields = {name: field for encoder in self._encoders.values() for name, field in encoder.fields.items()}
+        self._reason_bits = [(int(reason), 1 << self._fields[reason_signal(reason)].shift) for reason in Reason]
+        signals = [(role, self._fields.get(sensor_signal(role))) for role in ROLES]
+        self._sensor_bits = [(role, 1 << field.shift) for role, field in signals if field]
+        self._packed: tuple[Estimate | None, int] = None, 0  # the last status
 
     @cached_property
     def identifiers(self) -> frozenset[int]:
         """Of the frames that are sent; EFF_FLAG is set in those of 29 bits."""
-        return frozenset(layout.identifier for layout in self._layouts.values())
+        return frozenset(encoder.identifier for encoder in self._encoders.values())
 
     def sent(self) -> dict[int, Message]:
-        """What is sent, by the identifiers that are used."""
-        return {self._layouts[name].identifier: message for name, message in self.messages.items()}
+        """The messages by the identifiers that they are sent with."""
+        return {self._encoders[name].identifier: message for name, message in self.messages.items()}
 
     def may_have_sent(self, frame: Frame) -> bool:
-        """Whether `frame` is like ours, in identifier and checksum: an earlier run's, if it stands in a log."""
+        """Whether `frame` is like ours, in identifier and checksum: if it is in a log, an earlier run sent it."""
         _, identifier, data, _ = frame
         return identifier in self.identifiers and len(data) == LENGTH and crc8_sae_j1850(data[:-1]) == data[-1]
 
     def dbc(self) -> bytes:
-        """The DBC file of what is sent: `file` with the identifiers that are used."""
-        new = {b"%d" % identifier_of(m): b"%d" % self._layouts[name].identifier for name, m in self.messages.items()}
+        """The text of `file` with the identifiers that the frames are sent with."""
+        new = {b"%d" % identifier_of(m): b"%d" % self._encoders[name].identifier for name, m in self.messages.items()}
         return _NUMBERED.sub(lambda found: found[1] + b" " + new.get(found[2], found[2]), self.file.read_bytes())
 
     def greatest(self, signal: str) -> float:
-        """The most that `signal` can say, in the unit of the DBC."""
+        """The largest value of `signal`, in the unit of the DBC."""
         field = self._fields[signal]
         return max(limit * field.scale + field.offset for limit in (field.low, field.high))
 
@@ -124,7 +123,7 @@ class Publisher:
                 "RANGE_RemainingFull": _scaled(e.range_full, 1e-3) if known else None,
                 "RANGE_ChargePower": e.charge_power if known else None,
             },
-            "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
+            "RANGE_Sensors": {},
             "RANGE_Why": _why(e.why if known else None),
             "RANGE_Route": {
                 "RANGE_ArrivalStateOfCharge": _scaled(e.arrival_soc, 100) if known else None,
@@ -134,24 +133,28 @@ class Publisher:
                 "RANGE_RouteState": e.route_state,
             },
         }
-        return [self._frame(name, values, time_ns) for name, values in frames.items()]
+        distrusted = sum(bit for role, bit in self._sensor_bits if role in e.distrusted)
+        out = []
+        for name, values in frames.items():
+            encoder = self._encoders[name]
+            out.append(encoder.frame(encoder.pack(values, distrusted if name == "RANGE_Sensors" else 0), time_ns))
+        return out
 
     def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
-        """The frame of every tenth of a second."""
+        """The frame of every tenth of a second. `estimate` may not be changed afterwards: it is packed once."""
+        if estimate is not self._packed[0]:
+            self._packed = estimate, self._pack_status(estimate)
+        return [self._encoders["RANGE_Status"].frame(self._packed[1], time_ns)]
+
+    def _pack_status(self, estimate: Estimate) -> int:
         state = self.reported(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
         if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
             soc = sigma = None  # neither is of use without the other
-        values: dict[str, float | None] = {
-            SOC: soc,
-            SIGMA: sigma,
-            "RANGE_StatusState": state,
-            "RANGE_Activity": estimate.activity,
-        }
+        values = {SOC: soc, SIGMA: sigma, "RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
         reasons = int(estimate.reasons)
-        if reasons != self._reasons[0]:
-            self._reasons = reasons, sum(field.bits(True) for bit, field in self._reason_fields if reasons & bit)
-        return [self._frame("RANGE_Status", values, time_ns, self._reasons[1])]
+        bits = sum(bit for reason, bit in self._reason_bits if reasons & reason)
+        return self._encoders["RANGE_Status"].pack(values, bits)
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
@@ -174,25 +177,6 @@ class Publisher:
     def _can_say(self, signal: str, value: float | None) -> bool:
         return self._fields[signal].raw(value) is not None
 
-    def _frame(self, name: str, values: dict[str, float | None], time_ns: int, bits: int = 0) -> Frame:
-        """bits: of what is not in the layout's fields."""
-        layout = self._layouts[name]
-        counter = self._counters[name]
-        self._counters[name] = (counter + 1) % layout.counts
-        values[layout.counter] = counter
-        word = layout.unused | bits
-        for field in layout.fields:
-            value = values.get(field.name)  # None: not one of ours
-            if value is not False:  # most flags are that, and 0 is nothing to set
-                word |= field.bits(value)
-        data = word.to_bytes(7, layout.order)
-        return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
-
-
-def with_flag(identifier: int) -> int:
-    """`identifier` with EFF_FLAG if it has more than 11 bits."""
-    return identifier | EFF_FLAG if identifier > MOST_STANDARD else identifier
-
 
 SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
 KNOWN = (State.VALID, State.DEGRADED)
@@ -210,7 +194,7 @@ def reason_signal(reason: Reason) -> str:
 
 
 def _why(why: Explanation | None) -> dict[str, float | None]:
-    """The rated range and the two largest causes; none for what is not known."""
+    """The rated range and the two largest causes; unknown ones are None."""
     nothing: tuple[Cause, float | None] = Cause.NONE, None
     values: dict[str, float | None] = {"RANGE_WhyRated": why.reference * 1e-3 if why else None}
     for i, (cause, size) in enumerate([*(why.largest() if why else ()), nothing, nothing][:2], 1):
@@ -228,69 +212,60 @@ def _scaled(value: float | None, factor: float) -> float | None:
 def range_messages(file: Path) -> dict[str, Message]:
     """The messages of our own frames in a DBC file, by name; there may be others in it.
 
-    InputError for what is missing that ``dbc/range.dbc`` has, and for what cannot be sent.
+    InputError for a message or signal of ``dbc/range.dbc`` that is missing or cannot be sent.
     """
     own = find_dbc(RANGE_DBC)
     standard = load_database([own])
-    database = standard if file == own else load_database([file])
-    found = {message.name: message for message in database.messages}
+    found = {message.name: message for message in (standard if file == own else load_database([file])).messages}
     for wanted in standard.messages:
-        message = found.get(wanted.name)
-        if message is None:
-            raise InputError(
-                f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{nearest(wanted.name, found)}"
-            )
-        if problem := _unfit(message, wanted):
+        if wanted.name not in found:
+            near = nearest(wanted.name, found)
+            raise InputError(f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{near}")
+        if problem := _message_problem(found[wanted.name], wanted):
             raise InputError(f"{file}: message {wanted.name}: {problem}")
     return {wanted.name: found[wanted.name] for wanted in standard.messages}
 
 
-def _unfit(message: Message, wanted: Message) -> str:
-    """What is wrong with `message`, which shall carry what `wanted` of ``dbc/range.dbc`` does; else nothing."""
+def _message_problem(message: Message, wanted: Message) -> str:
+    """Why `message` cannot carry the signals of `wanted`, a message of ``dbc/range.dbc``; empty if it can."""
     if message.length != 8 or message.is_fd:
         return f"must have 8 bytes in a classic frame, has {message.length}{' in a CAN FD frame' * message.is_fd}"
     signals = {signal.name: signal for signal in message.signals}
     if len({signal.byte_order for signal in message.signals}) > 1:
         return "its signals must all have the same byte order"
     for model in wanted.signals:
-        signal = signals.get(model.name)
-        if signal is None:
+        if model.name not in signals:
             return f"has no signal {model.name}{nearest(model.name, signals)}"
-        if problem := _unfit_signal(signal, model):
-            return f"signal {signal.name} {problem}"
+        if problem := _signal_problem(signals[model.name], model):
+            return f"signal {model.name} {problem}"
     return ""
 
 
-def _unfit_signal(signal: Signal, model: Signal) -> str:
+def _signal_problem(signal: Signal, model: Signal) -> str:
     if signal.conversion.is_float or signal.is_multiplexer or signal.multiplexer_ids is not None:
         return "must be an integer that is in every frame (not floating point, not multiplexed)"
     if model.name.endswith("CRC"):
         return "" if (signal.length, first_bit(signal)) == (8, 56) else "must be the last byte, all 8 bits of it"
     if first_bit(signal) + signal.length > 56:
         return "stands in the last byte, which is the checksum's"
+    unit = model.unit or ""
     if model.length >= 8:  # a quantity, with a code for not available
-        if (signal.unit or "") != (model.unit or ""):
-            return (
-                f"has unit {signal.unit or ''!r}, must have {model.unit or ''!r}; only its scale and place may differ"
-            )
+        if (signal.unit or "") != unit:
+            return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
         if signal.length < 8:
             return f"needs 8 bits or more for the code 'not available', has {signal.length}"
-        needed = (0, 100) if model.name == SOC else (0,)
-        field = _field(signal, 0)
-        missing = [value for value in needed if field.raw(value) is None]
-        return f"must be able to say {missing[0]} {model.unit or ''}".rstrip() if missing else ""
+        missing = [value for value in (0, 100 if model.name == SOC else 0) if _field(signal).raw(value) is None]
+        return f"must be able to say {missing[0]} {unit}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
-    if (signal.conversion.scale, signal.conversion.offset, low) != (1, 0, 0) or high < most:
-        return f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
-    return ""
+    is_whole = (signal.conversion.scale, signal.conversion.offset, low) == (1, 0, 0) and high >= most
+    return "" if is_whole else f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
 
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A signal's place in its message, an integer of the first seven bytes, and what can stand in it."""
+    """The place of a signal in its message, an integer of the first seven bytes, and its raw values."""
 
-    name: str
     shift: int
     mask: int
     low: float
@@ -300,53 +275,60 @@ class _Field:
     absent: int
 
     def raw(self, value: float | None) -> int | None:
-        """The nearest raw value; None if `value` is not known, not finite, or beyond what the signal can say."""
+        """The nearest raw value; None if `value` is unknown, not finite, or outside the range of the signal."""
         if value is None or not abs(value) < 1e12:  # infinity and NaN too
             return None
         raw = round((value - self.offset) / self.scale)
         return raw if self.low <= raw <= self.high else None
 
     def bits(self, value: float | None) -> int:
-        """The nearest raw value, or the code for not available, at its place."""
+        """The nearest raw value, or the code for not available, shifted to its place."""
         raw = self.raw(value)
         return (self.absent if raw is None else raw & self.mask) << self.shift
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """A message: its counter counts 0 to `counts` - 1; `unused` bits are ones."""
+@dataclass(slots=True)
+class _Encoder:
+    """Packs one message. cantools would take five times as long."""
 
     identifier: int
     order: Literal["little", "big"]
-    unused: int
-    fields: list[_Field]
-    counter: str
+    blank: int  # ones in unused bits; signals that are not ours are not available
+    fields: dict[str, _Field]  # ours, but for counter and CRC
+    counter_shift: int
     counts: int
+    counter: int = 0  # of the next frame, below `counts`
+
+    def pack(self, values: Mapping[str, float | None], flags: int = 0) -> int:
+        """The signals at their places, without counter. flags: the bits of the fields that `values` leaves out."""
+        word = self.blank | flags
+        for name, value in values.items():
+            word |= self.fields[name].bits(value)
+        return word
+
+    def frame(self, word: int, time_ns: int) -> Frame:
+        """The next frame, of a word from `pack`."""
+        data = (word | self.counter << self.counter_shift).to_bytes(7, self.order)
+        self.counter = (self.counter + 1) % self.counts
+        return time_ns, self.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
 
 
-def _field(signal: Signal, shift: int) -> _Field:
+def _field(signal: Signal) -> _Field:
+    first = first_bit(signal)
     low, high = raw_range(signal, not_available=True)
     mask = 2**signal.length - 1
     absent = 2 ** (signal.length - 1) if signal.is_signed else mask
-    conversion = signal.conversion
-    return _Field(signal.name, shift, mask, low, high, float(conversion.offset), float(conversion.scale), absent)
+    shift = first if signal.byte_order == "little_endian" else 56 - first - signal.length
+    return _Field(shift, mask, low, high, float(signal.conversion.offset), float(signal.conversion.scale), absent)
 
 
-def _layout(message: Message, identifier: int) -> _Layout:
-    """The places of all signals but the CRC, which is the last of the eight bytes, sent as `identifier`.
-
-    cantools would take five times as long to encode them.
-    """
-    little = message.signals[0].byte_order == "little_endian"
-    counter = f"{message.name}Counter"
-    fields = []
-    unused = 2**56 - 1
-    counts = 0
-    for signal in message.signals:
-        if signal.name == counter:
-            counts = int(raw_range(signal, not_available=True)[1]) + 1
-        if signal.name.endswith("CRC"):
-            continue
-        fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
-        unused &= ~(fields[-1].mask << fields[-1].shift)
-    return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)
+def _encoder(message: Message, identifier: int) -> _Encoder:
+    fields = {signal.name: _field(signal) for signal in message.signals if not signal.name.endswith("CRC")}
+    blank = 2**56 - 1
+    for name, field in fields.items():
+        blank &= ~(field.mask << field.shift)
+        if not name.startswith("RANGE_"):
+            blank |= field.absent << field.shift
+    counter = fields.pop(f"{message.name}Counter")
+    order: Literal["little", "big"] = "little" if message.signals[0].byte_order == "little_endian" else "big"
+    return _Encoder(identifier, order, blank, fields, counter.shift, int(counter.high) + 1)

@@ -30,7 +30,7 @@ _LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with th
 
 
 @dataclass(frozen=True)
-class Limits:
+class LogLimits:
     """How often a `Recorder` syncs, when it closes a file, how much it keeps, how long it waits after an error.
 
     InputError if one file may be larger than all files together.
@@ -50,7 +50,7 @@ class Limits:
             )
 
 
-LIMITS = Limits()
+LIMITS = LogLimits()
 
 
 class Recorder:
@@ -59,7 +59,7 @@ class Recorder:
     A write error raises nothing: it is counted in `errors` (text in `last_error`), closes the file, and recording
     continues with a new file `retry_s` later. `lost_frames` counts the frames not known to be in a file. Before a new
     file is started, the oldest files with such a name (by running number, because clocks are set) are deleted until
-    all of them stay below `max_total_bytes` and the file system keeps the room that `free_space` reserves. Other
+    all of them stay below `max_total_bytes` and the file system keeps the room that `spare_bytes` reserves. Other
     files, and files that are being written, are not touched.
     """
 
@@ -69,7 +69,7 @@ class Recorder:
         vehicle: str,
         metadata: Mapping[str, str] | None = None,
         attachments: Mapping[str, bytes] | None = None,
-        limits: Limits = LIMITS,
+        limits: LogLimits = LIMITS,
     ) -> None:
         self.paths: list[Path] = []
         self.errors = 0
@@ -158,7 +158,7 @@ class Recorder:
             self._failed_ns = now_ns - self._retry_ns
         elif file.size() >= self._file_bytes or abs(now_ns - file.start_ns) >= self._limits.max_age_s * 1e9:
             self._close_file(file)
-        elif not self._delete_oldest(self._leaves_free):
+        elif not self._delete_oldest(lambda: spare_bytes(self._directory) >= 0):
             self._close_file(file)
             self._note(OSError(errno.ENOSPC, "the disk is full", str(self._directory)), now_ns)
 
@@ -173,23 +173,20 @@ class Recorder:
         if self._failed_ns is not None and abs(start_ns - self._failed_ns) < self._retry_ns:
             return None
         self._synced_ns = None
+        stream = None
         try:
             self._directory.mkdir(parents=True, exist_ok=True)
             self._make_room()
             stream = self._create(start_ns)
-        except (OSError, ValueError, OverflowError) as error:  # of the disk, or the time is no date
-            self._note(error, start_ns)
-            return None
-        try:
-            lock(stream)
             file = LogFile(stream, start_ns, self._metadata, self._attachments)
             for topic, (schema, metadata) in self._channels.items():
                 file.channel(topic, schema, metadata)
-        except Exception as error:
-            with contextlib.suppress(OSError):
-                stream.close()
+        except Exception as error:  # of the disk, or the time is no date
             self._note(error, start_ns)
-            self._discard()
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+                self._discard()
             return None
         self._failed_ns = None
         self._file = file
@@ -200,6 +197,7 @@ class Recorder:
         number = max((number for number, _, _ in self._own()), default=0) + 1
         path = self._directory / f"{start}_{self._vehicle}{'' if number == 1 else f'~{number}'}.mcap"
         stream = path.open("xb")
+        lock(stream)
         self.paths.append(path)
         sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
         return stream
@@ -215,20 +213,16 @@ class Recorder:
             if not path.stat().st_size:  # a power cut came before the first sync
                 _delete(path)
         total = self._total_bytes()
-        free, keep = free_space(self._directory)
-        room = free - keep + total  # for all of ours together
+        spare = spare_bytes(self._directory)
+        room = spare + total  # for all of ours together
         if room < _LEAST_ROOM:
-            raise OSError(errno.ENOSPC, f"no room for a log: {max(free, 0) >> 10} kB are free", str(self._directory))
+            raise OSError(errno.ENOSPC, f"no room: {max(spare, 0) >> 10} kB are free for logs", str(self._directory))
         self._file_bytes = min(self._limits.max_file_bytes, room // 4)  # small on a small disk: the oldest goes whole
         allowed = min(self._limits.max_total_bytes, room) - self._file_bytes
         self._delete_oldest(lambda: self._total_bytes() <= allowed)
 
     def _total_bytes(self) -> int:
         return sum(path.stat().st_size for _, _, path in self._own())
-
-    def _leaves_free(self) -> bool:
-        free, keep = free_space(self._directory)
-        return free >= keep
 
     def _delete_oldest(self, is_enough: Callable[[], bool]) -> bool:
         """Delete our oldest files, but for the one being written, until `is_enough`; False if it never is."""
@@ -269,25 +263,20 @@ def lock(stream: IO[bytes]) -> bool:
     return True
 
 
-def free_space(directory: Path) -> tuple[int, int]:
-    """Bytes free on the file system of a directory, and how many of them our logs leave to others.
+def spare_bytes(directory: Path) -> int:
+    """Bytes free on the file system of a directory beyond those that our logs leave to others.
 
-    That is a twentieth of it, but 64 MiB on one below 1.3 GB, and a quarter on one below 256 MiB.
+    These are a twentieth of it, but 64 MiB on one below 1.3 GB, and a quarter on one below 256 MiB.
     """
     there = os.statvfs(directory)
     size = there.f_blocks * there.f_frsize
     if not size:  # unknown on some file systems
-        return 1 << 62, 0
-    return there.f_bavail * there.f_frsize, min(max(size // 20, _LEFT_FREE), size // 4)
+        return 1 << 62
+    return there.f_bavail * there.f_frsize - min(max(size // 20, _LEFT_FREE), size // 4)
 
 
-def _delete(path: Path) -> bool:
-    """Delete a log, unless it is being written."""
-    try:
-        with path.open("rb") as stream:
-            if not lock(stream):
-                return False
+def _delete(path: Path) -> None:
+    """Delete a log, unless it is being written, is not ours to delete, or is gone."""
+    with contextlib.suppress(OSError), path.open("rb") as stream:
+        if lock(stream):
             path.unlink()
-    except OSError:  # not ours to delete, or gone
-        return False
-    return True

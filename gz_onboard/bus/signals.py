@@ -1,11 +1,11 @@
-"""All signals of recorded frames, in the units of the DBC, for tables and for an MCAP of signals."""
+"""Decode all signals of recorded frames, in the units of the DBC, for tables and for an MCAP of signals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.answers import NEGATIVE, Answers, Take, by_response
+from gz_onboard.bus.answers import NEGATIVE, AnswerReader, Take, by_response
 from gz_onboard.bus.layout import raw_range, raw_values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
@@ -21,7 +21,7 @@ Decoded = tuple[int, str, Values]
 
 
 class MessageSignals:
-    """All signals of one message. not_available: whether all ones stand for it."""
+    """Decodes all signals of one message. not_available: whether all ones mean that."""
 
     def __init__(self, message: Message, not_available: bool = True) -> None:
         self.message = message
@@ -42,7 +42,7 @@ class MessageSignals:
 
 
 class Decoder:
-    """All signals of the frames of one bus, and of answers; what cannot be decoded is counted, never guessed."""
+    """Decodes all signals of the frames of one bus, and of answers; counts the frames that it cannot decode."""
 
     def __init__(self, mapping: BusMapping) -> None:
         self.unknown = self.undecodable = self.copies = 0
@@ -53,10 +53,9 @@ class Decoder:
         ]
         self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
         self._signals = {m.name: MessageSignals(m, mapping.not_available) for m in mapping.database.messages}
-        self._own: set[tuple[int, int]] = set()  # channel and identifier of what is taken
         self._whole: list[tuple[str, Values]] = []  # answers, of the frame that completed them
         self._answers = {
-            response: Answers(those, [self._taker(request.message) for request in those], self._dropped)
+            response: AnswerReader(those, [self._taker(request.message) for request in those], self._dropped)
             for response, those in by_response(mapping.requests).items()
         }
         self._asked = {request.request for request in mapping.requests}
@@ -80,15 +79,11 @@ class Decoder:
                     yield time_ns, message.name, self._row(message, values)
 
     def _takes(self, message: Message, channel: int, identifier: int, data: bytes) -> bool:
-        place, origins = (channel, identifier), self.origins
-        if place not in self._own:
-            self._own.clear()  # another may have had the message
-            if not origins.claim(message, channel, identifier):
-                origins.differs(message, channel, identifier, data)
-                return False
-            self._own.add(place)
-        if message.name in origins.recent:
-            origins.own(message.name, data)
+        if not self.origins.claim(message, channel, identifier):
+            self.origins.differs(message, channel, identifier, data)
+            return False
+        if message.name in self.origins.recent:
+            self.origins.own(message.name, data)
         return True
 
     def _row(self, message: Message, values: Values) -> Values:

@@ -1,4 +1,4 @@
-"""Units of signals in DBC files, and their conversion to the SI units of the roles."""
+"""Convert the units of signals in DBC files to the SI units of the roles."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import Daemon, foreign_text, state_text
 from gz_onboard.daemon.route import SOCKET
@@ -135,7 +135,7 @@ def _recorder(arguments: argparse.Namespace, vehicle: Vehicle) -> Recorder:
     metadata = {"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle))}
     if arguments.payload is not None:
         metadata["payload_kg"] = f"{arguments.payload:g}"
-    limits = Limits(
+    limits = LogLimits(
         max_file_bytes=LOG_FILE_BYTES, max_age_s=LOG_FILE_S, max_total_bytes=round(arguments.log_total_mb * 1e6)
     )
     return Recorder(arguments.log_dir, vehicle.name, metadata=metadata, attachments=dbc_texts(vehicle), limits=limits)

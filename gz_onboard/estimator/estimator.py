@@ -110,10 +110,11 @@ class Estimator:
 
     # --- one step ---------------------------------------------------------------------------------------------
 
-    def step(self, now: float, windows: Sequence[MessageWindow]) -> None:
-        """Take the `windows` of messages that end at `now` [s] and go on by them; without any nothing happens."""
+    def step(self, windows: Sequence[MessageWindow]) -> None:
+        """Take what came of each message in one window and go on to the last of it; without any nothing happens."""
         if not windows:
             return
+        now = max(self._time or 0.0, *(window.time for window in windows))
         for window in windows:
             self._timing.take(window)
             for signal, samples in zip(self._slots[window.group], window.roles, strict=True):

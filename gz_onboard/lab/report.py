@@ -38,18 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--route")
     text = "page to write (default: the name of the ride, or of several `rides`, with .html)"
     parser.add_argument("-o", "--output", type=Path, metavar="HTML", help=text)
-    parser.add_argument("--format", type=_one_format, help=argparse.SUPPRESS)
     parser.add_argument("--no-path", action="store_true", help="leave out where the ride was")
     add_shared(parser, "--jobs", "--quiet")
-
-
-def _one_format(given: str) -> str:
-    """Of the pictures of other commands: here there are none."""
-    if given.lower() == "html":
-        return given
-    raise argparse.ArgumentTypeError(
-        "the report is a page in HTML, which any browser prints as PDF; pictures are made by `gz-onboard estimate`"
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Frames and signals of a log into files of other formats; what ``gz-onboard export`` and ``simulate`` write."""
+"""Write frames and signals of a log in other formats, for ``gz-onboard export`` and ``simulate``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
-from gz_onboard.recording import logs, tables
-from gz_onboard.recording.writers import write_blf, write_candump
+from gz_onboard.recording import logs
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -24,7 +23,7 @@ _FORMATS = (*_TEXT_FORMATS, ".blf", ".mf4", ".parquet", ".mcap")
 
 
 def out_suffix(out: Path) -> str:
-    """The suffix of `out` that says its format, lower case, without the .gz of a packed file."""
+    """The format of `out` as a lower-case suffix, without the .gz of a packed file; InputError if it is unknown."""
     suffixes = [suffix.lower() for suffix in out.suffixes]
     packed = suffixes[-1:] == [".gz"]
     suffix = "".join(suffixes[-2:-1] if packed else suffixes[-1:])
@@ -40,37 +39,33 @@ def out_suffix(out: Path) -> str:
 
 @contextmanager
 def whole(out: Path, suffix: str) -> Iterator[Path]:
-    """Where to write `out` within, which has its name once it is complete; but a folder of tables at once.
+    """A name to write a file to, which is renamed to `out` once it is complete; a folder of tables is written in place.
 
     Errors are as of `writing`.
     """
+    if not suffix:
+        with writing(out):
+            yield out
+        return
     packed = ".gz" if out.suffix.lower() == ".gz" else ""  # python-can takes a name with one dot more for no format
-    part = out.with_name(f".part-{out.name.replace('.', '-')}{suffix}{packed}") if suffix else out
+    part = out.with_name(f".part-{out.name.replace('.', '-')}{suffix}{packed}")
     with writing(out):
         try:
             yield part
-            if suffix:
-                part.replace(out)
+            part.replace(out)
         except OSError as error:
-            error.filename = None  # `out` is what the user knows
+            error.filename = None  # `out` is the name that the user knows
             raise
         finally:
-            if suffix:
-                with suppress(OSError):  # there is none
-                    part.unlink()
+            with suppress(OSError):  # there is none
+                part.unlink()
 
 
 # --- frames ----------------------------------------------------------------------------------------------------
 
 
 def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
-    """Write the frames to `out` in the format of `suffix`; gives how many it were."""
-    if suffix == ".log":
-        with tables.open_text(out) as text:
-            return write_candump(text, batches)
-    if suffix == ".blf":
-        with out.open("wb") as binary:
-            return write_blf(binary, batches)
+    """Write the frames to `out` by python-can, in the format of `suffix`; returns their number."""
     from gz_onboard.bus._can import can
     from gz_onboard.recording.readers.python_can import message_of, with_asammdf
 
@@ -92,7 +87,7 @@ def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> i
 
 
 def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Frame]], section: Any) -> int:
-    """Everything that is in the log, and the signals of each message on a topic ``/can/MESSAGE``, by time."""
+    """Write the whole log, and the signals of each message on a topic ``/can/MESSAGE``, by time; count its samples."""
     first = next(batches, None)
     if first is None:
         raise InputError(f"{log}: no frames in the chosen part")

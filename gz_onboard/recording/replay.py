@@ -1,7 +1,7 @@
-"""``gz-onboard replay``: puts a recorded log onto a bus, in its own timing.
+"""``gz-onboard replay``: send a recorded log onto a bus, in its own timing.
 
-Each frame has its place on an absolute schedule against the monotonic clock, so delays do not add up: a frame that
-is late is sent at once, and the ones after it are on time again.
+Each frame has its place on an absolute schedule against the monotonic clock, so delays do not add up: a late frame is
+sent at once, and the ones behind it are on time again.
 """
 
 from __future__ import annotations
@@ -9,12 +9,11 @@ from __future__ import annotations
 import argparse
 import errno
 import socket
-import struct
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,20 +32,16 @@ SLOWEST = 1e-3  # a second in a quarter of an hour
 Send = Callable[[Frame], bool]
 """Puts one frame on the bus; False if it could not."""
 
-_CLASSIC = struct.Struct("=IB3x8s")  # struct can_frame
-_FD = struct.Struct("=IBB2x64s")  # struct canfd_frame
-_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_FD_FRAMES = 101, 1, 5
 _FULL_WAIT_S = 0.001
 _FULL_ATTEMPTS = 1000
-_EARLY_NS = 50_000
-"""Nearer than this a frame is sent now: sleeping takes as long."""
-_LOOP_GAP_NS = 1_000_000
+_EARLY_NS = 50_000  # sleeping takes as long: a frame due within this is sent now
+_LOOP_GAP_S = 0.001
 _PROGRESS_NS = 500_000_000
 
 
 @dataclass
 class Sent:
-    """Numbers of frames sent, the time it took [s], and the greatest delay of a frame [s]."""
+    """Numbers of frames, duration [s] and largest delay of a frame [s] of a replay."""
 
     sent: int = 0
     failed: int = 0
@@ -79,71 +74,39 @@ def replay(
     and is up to date when KeyboardInterrupt ends the replay.
     """
     summary = summary or Sent()
-    begin_ns = time.monotonic_ns()
+    begin_ns = shown_ns = time.monotonic_ns()
     before_s = summary.duration_s
     first_ns: int | None = None
-    told_ns = begin_ns
-    now_ns = begin_ns
-    worst_ns = round(summary.worst_lateness_s * 1e9)
     try:
-        for batch in batches:
-            for frame in batch:
-                if first_ns is None:
-                    first_ns = frame[0]
-                if speed:
-                    due_ns = begin_ns + round((frame[0] - first_ns) / speed)
-                    if due_ns - now_ns > _EARLY_NS:
-                        now_ns = time.monotonic_ns()
-                        while due_ns - now_ns > _EARLY_NS:
-                            # In short sleeps, so that Ctrl-C is heard and progress shown in a long gap.
-                            time.sleep(min(due_ns - now_ns, _PROGRESS_NS) * 1e-9)
-                            now_ns = time.monotonic_ns()
-                    elif now_ns - due_ns > worst_ns:
-                        worst_ns = now_ns - due_ns
-                if send(frame):
-                    summary.sent += 1
-                else:
-                    summary.failed += 1
-                now_ns = time.monotonic_ns()
-                if progress and now_ns - told_ns > _PROGRESS_NS:
-                    told_ns = now_ns
-                    progress((frame[0] - first_ns) * 1e-9)
+        for frame in chain.from_iterable(batches):
+            first_ns = frame[0] if first_ns is None else first_ns
+            if speed:
+                due_ns = begin_ns + round((frame[0] - first_ns) / speed)
+                while (early_ns := due_ns - time.monotonic_ns()) > _EARLY_NS:
+                    # In short sleeps, so that Ctrl-C is heard and progress shown in a long gap.
+                    time.sleep(min(early_ns, _PROGRESS_NS) * 1e-9)
+                summary.worst_lateness_s = max(summary.worst_lateness_s, -early_ns * 1e-9)
+            if send(frame):
+                summary.sent += 1
+            else:
+                summary.failed += 1
+            if progress and time.monotonic_ns() - shown_ns > _PROGRESS_NS:
+                shown_ns = time.monotonic_ns()
+                progress((frame[0] - first_ns) * 1e-9)
     finally:
         summary.duration_s = before_s + (time.monotonic_ns() - begin_ns) * 1e-9
-        summary.worst_lateness_s = worst_ns * 1e-9
     return summary
 
 
-def socket_sender(raw: socket.socket) -> Send:
-    """Sends through a raw CAN socket."""
-    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"")  # nothing is received here, so nothing need be queued
-    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
-
-    def put(frame: Frame) -> None:
-        _, identifier, data, _ = frame
-        if len(data) <= 8:
-            raw.send(_CLASSIC.pack(identifier, len(data), data))
-        else:
-            raw.send(_FD.pack(identifier, len(data), 0, data))
-
-    return _patient(put)
-
-
 def bus_sender(bus: can.BusABC) -> Send:
-    """Sends through any of python-can's interfaces."""
-    from gz_onboard.recording.readers.python_can import message_of
-
-    return _patient(lambda frame: bus.send(message_of(frame, with_time=False)))
-
-
-def _patient(put: Callable[[Frame], None]) -> Send:
-    """Sends by `put`. A full queue is waited for; a bus that is down loses frames, as a bus does."""
+    """Sends by python-can. Waits for room in a full queue; a bus that is down loses frames, as a bus does."""
     from gz_onboard.bus._can import can
+    from gz_onboard.recording.readers.python_can import message_of
 
     def send(frame: Frame) -> bool:
         for _ in range(_FULL_ATTEMPTS):
             try:
-                put(frame)
+                bus.send(message_of(frame, with_time=False))
                 return True
             except (can.CanError, OSError) as error:
                 if getattr(error, "error_code", getattr(error, "errno", None)) not in (errno.ENOBUFS, errno.EAGAIN):
@@ -181,31 +144,29 @@ def run(arguments: argparse.Namespace) -> int:
             f"--speed {arguments.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more"
         )
     damages: list[LogDamage] = []
-    parts = _parts(arguments, damages)
-    names = [name for name in arguments.channel.split(",") if name]
-    buses = _open_buses(arguments.interface, names)
+    parts = _parts(arguments, damages)  # a missing log is named before a missing bus
+    buses = _open_buses(arguments.interface, [name for name in arguments.channel.split(",") if name])
+    senders = [bus_sender(bus) for bus in buses]
     summary = Sent()
     status = OK
     try:
-        senders = [_sender(bus) for bus in buses]
-        send = senders[0] if len(senders) == 1 else _by_channel(senders)
         with progress_bar(lambda: None, quiet=arguments.quiet) as display:
-
-            def show(log: Path, seconds: float) -> None:
-                what = "the log" if len(parts) == 1 else log.name
-                display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
-
             while True:
                 summary.loops += 1
                 for log, frames in parts:
+                    what = "the log" if len(parts) == 1 else log.name
+
+                    def show(seconds: float, what: str = what) -> None:
+                        display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
+
                     kept = _sendable(frames, len(senders))
                     summary.skipped += len(frames) - len(kept)
-                    replay(kept.batches(), send, arguments.speed, summary, partial(show, log))
+                    replay(kept.batches(), _by_channel(senders), arguments.speed, summary, show)
                 if not summary.sent and not summary.failed:
                     raise InputError(f"{arguments.log}: no frames to send in the chosen part")
                 if not arguments.loop:
                     break
-                time.sleep(_LOOP_GAP_NS * 1e-9)
+                time.sleep(_LOOP_GAP_S)
     except KeyboardInterrupt:
         status = INTERRUPTED
     finally:
@@ -251,17 +212,9 @@ def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
 
 
 def _by_channel(senders: list[Send]) -> Send:
-    def send(frame: Frame) -> bool:
-        return senders[frame[3] & ~TRANSMITTED](frame)
-
-    return send
-
-
-def _sender(bus: can.BusABC) -> Send:
-    raw = getattr(bus, "socket", None)
-    if isinstance(raw, socket.socket) and raw.family == getattr(socket, "AF_CAN", None):
-        return socket_sender(raw)
-    return bus_sender(bus)
+    if len(senders) == 1:
+        return senders[0]
+    return lambda frame: senders[frame[3] & ~TRANSMITTED](frame)
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
@@ -269,10 +222,13 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
     from gz_onboard.bus.socketcan import NO_SOCKETS
 
     check_interface(interface)
+    if not names:
+        raise InputError("--channel: no channel is named")
     buses: list[can.BusABC] = []
+    options = {"fd": True} if interface == "socketcan" else {}
     for name in names:
         try:
-            buses.append(open_bus(interface, name))
+            buses.append(open_bus(interface, name, **options))
         except (OSError, can.CanError, ImportError, ValueError) as error:
             for bus in buses:
                 bus.shutdown()
@@ -281,6 +237,4 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
             raise InputError(
                 f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
             ) from None
-    if not buses:
-        raise InputError("--channel: no channel is named")
     return buses

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.events import Frame
 from gz_onboard.location_rows import LOCATION_SCHEMA, location_row
 from gz_onboard.pipeline import Pipeline
@@ -26,7 +26,7 @@ SECONDS = 120
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of two minutes of a recorded ride, drained ten times a second and synced at odd times."""
-    recorder = Recorder(tmp_path_factory.mktemp("log"), "reference", limits=Limits(sync_s=1.3))
+    recorder = Recorder(tmp_path_factory.mktemp("log"), "reference", limits=LogLimits(sync_s=1.3))
     pipeline = Pipeline(read_vehicle("reference"), log=recorder)
     tick: list[Frame] = []
     start = 0

@@ -339,11 +339,7 @@ def test_a_broken_dbc(tmp_path, change, parts):
             {"Pack.Current"},
             "line 5: signal Current is a float of 16",
         ),
-        (("BO_ 256 Pack", "BO_ 3221225728 Pack"), {"Pack.*"}, "line 5: Extended frame id 0x40000100 is more than 29"),
-        (("BO_ 256 Pack", "BO_ 1610612992 Pack"), {"Pack.*"}, "line 5: Standard frame id 0x60000100 is more than 11"),
         (("BO_ 256 Pack", "BO_ 256 2Pack"), {"2Pack.*"}, "line 5: Invalid syntax"),
-        (("0|16@1- (1", "100000|16@1- (1"), {"Motor.Speed"}, "line 13: .*beyond the longest frame"),
-        (("BO_ 257", 'CM_ "no end"\nBO_ 257'), set(), "line 12: Invalid syntax"),
         (
             ("BA_DEF_ BO_", 'VAL_ 256 Charge 0 "a" 1 "b" ;\nBA_DEF_ BO_'),
             set(),
@@ -373,12 +369,11 @@ SIGNALS = {"Pack": ["Voltage", "Current", "State", "Counter", "Sum"], "Motor": [
     [
         ('pack_voltage = "Voltage"', ["Voltage", "Pack", "v.dbc, line 5: The signals", "overlapping"]),
         ('pack_current = { message = "Pack", signal = "Current" }', ["Current", "v.dbc, line 5: The signals"]),
-        ('motor_speed = "Speed"', ["Speed", "Motor", "v.dbc, line 12: Extended frame id 0x40000101"]),
-        ('motor_speed = { message = "Motor", signal = "Speed" }', ["message Motor", "v.dbc, line 12: "]),
+        ('motor_speed = "Speed"', ["Speed", "2Motor", "v.dbc, line 12: Invalid syntax"]),
     ],
 )
 def test_a_role_of_a_signal_that_was_left_out_says_why(tmp_path, role, parts):
-    text = DBC.replace("16|16@1- (0.1", "8|16@1- (0.1").replace("BO_ 257 Motor", "BO_ 3221225729 Motor")
+    text = DBC.replace("16|16@1- (0.1", "8|16@1- (0.1").replace("BO_ 257 Motor", "BO_ 257 2Motor")
     message = complaint(tmp_path, dbc=text, roles=role)
     for part in [":5: roles.", "is left out of the DBC file", *parts]:
         assert part in message

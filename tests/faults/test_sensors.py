@@ -7,7 +7,7 @@ from math import log, sqrt
 
 import pytest
 
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from tests.faults.support import (
     BEGIN,
     END,
@@ -146,7 +146,7 @@ def test_stale_after_ten_periods_and_not_before():
     since = (last - ride()[0][0]) / S
     run = ridden(spoilt(without("BMS_Cells")))
     missing = [e.time for e in run.estimates if e.time > BEGIN and e.reasons & Reason.NO_CELL_TEMPERATURE]
-    assert missing[0] - since == pytest.approx(10.0, abs=0.11)
+    assert missing[0] - since == pytest.approx(10.0, abs=WINDOW / 2 + 0.1)
     assert all(e.cell_temperature is not None for e in run.between(5.0, RIDE))  # the last known stands in
 
 

@@ -140,7 +140,7 @@ def test_a_gap(seconds: float, live: bool):
     assert all(e.reasons & lost == lost for e in silent)
     assert all(e.state is State.INVALID and e.speed is None and e.pack_current is None for e in silent)
     if seconds == 20.0 and live:
-        assert len(silent) > 150  # a silent bus is told ten times a second
+        assert len(silent) > 30  # a silent bus is told at each window
     status = check_frames(run.sent)["RANGE_Status"]
     invalid = [row for row in status if row["RANGE_StatusState"] == State.INVALID]
     assert all(row["RANGE_StateOfCharge"] > 100 for row in invalid)  # the code for not available
@@ -158,6 +158,6 @@ def test_a_bus_that_is_silent_from_the_start():
         run.pipeline.advance((), ride()[0][0] + t * MS)
     check_sound(run)
     assert all(e.state in (State.STARTING, State.INVALID) for e in run.estimates)
-    assert len(run.estimates) == pytest.approx(300, abs=2)
+    assert len(run.estimates) == pytest.approx(60, abs=2)
     decoded = check_frames(run.sent)
     assert all(row["RANGE_Remaining"] > 655.34 for row in decoded["RANGE_Estimate"])

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from gz_onboard.events import Reason, State
+from gz_onboard.events import WINDOW, Reason, State
 from tests.faults.support import RIDE, USUAL, check_all, check_no_jump, ride, unspoilt
 from tests.support import check_sound, reasons_in, received
 
@@ -19,7 +19,7 @@ def test_the_ride_itself_is_sound():
     assert {e.state for e in after} == {State.VALID}
     assert reasons_in(after) & ~USUAL == Reason(0)
     assert run.pipeline.counts().dropped == 0
-    assert all(b.time - a.time == pytest.approx(0.1, abs=1e-6) for a, b in pairwise(run.estimates))
+    assert all(b.time - a.time == pytest.approx(WINDOW, abs=1e-6) for a, b in pairwise(run.estimates))
 
 
 def test_in_rounds_like_the_daemon_it_is_the_same():

@@ -24,7 +24,7 @@ from unittest import mock
 from mcap.writer import MCAP0_MAGIC
 
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS
@@ -135,7 +135,7 @@ def cuts(count: int, source: Random, folder: Path, case: str) -> list[Cut]:
     file = folder / "state" / "scooter.json"
     channel = CanChannel("virtual", case)
     channel.open()
-    recorder = Recorder(folder / "log", "v", limits=Limits(max_file_bytes=200_000))
+    recorder = Recorder(folder / "log", "v", limits=LogLimits(max_file_bytes=200_000))
     daemon = Daemon(reference(), [channel], recorder, file)
     log, keeper = daemon._log, daemon._keeper
     assert log is not None

@@ -14,10 +14,9 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.recording.logs import read_frames
-from gz_onboard.recording.writers import write_blf, write_candump
 from gz_onboard.vehicle import read_vehicle
 from tests.bus.doctor import complaints
-from tests.support import LOGS
+from tests.support import LOGS, write_log
 
 DAY = 86_400 * 10**9
 YEARS = 5 * 365 * DAY
@@ -28,8 +27,7 @@ def leaping(file: Path, leap_ns: int) -> Path:
     """A recorded ride whose clock leaps in its middle."""
     frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
     half = frames[len(frames) // 2][0]
-    with file.open("wb") as stream:
-        write_blf(stream, [[(t + leap_ns * (t >= half), i, data, channel) for t, i, data, channel in frames]])
+    write_log(file, [(t + leap_ns * (t >= half), i, data, channel) for t, i, data, channel in frames])
     return file
 
 
@@ -43,7 +41,7 @@ def estimated(log: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, 
 
 
 def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys):
-    log, told = leaping(tmp_path / "leap.blf", YEARS), "ahead by 5.0 years"
+    log, told = leaping(tmp_path / "leap.mcap", YEARS), "ahead by 5.0 years"
     ride, said = estimated(log, capsys)
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
@@ -77,9 +75,8 @@ def restamped(file: Path, time_of: Callable[[int, int], int]) -> Path:
     """The ride with the time [ns] that `time_of` makes of each frame's number and time since the beginning."""
     frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
     first = frames[0][0]
-    with file.open("wb") as stream:
-        changed = [(first + time_of(n, t - first), i, data, channel) for n, (t, i, data, channel) in enumerate(frames)]
-        write_blf(stream, [changed])
+    changed = [(first + time_of(n, t - first), i, data, channel) for n, (t, i, data, channel) in enumerate(frames)]
+    write_log(file, changed)
     return file
 
 
@@ -91,7 +88,7 @@ def restamped(file: Path, time_of: Callable[[int, int], int]) -> Path:
     ],
 )
 def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
-    log = restamped(tmp_path / "ride.blf", time_of)
+    log = restamped(tmp_path / "ride.mcap", time_of)
     with pytest.raises(InputError, match=said):
         read_samples(log, read_vehicle("reference"))
     assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == 2
@@ -105,8 +102,7 @@ def test_stamps_that_wrap_each_second_are_refused_or_told(tmp_path, capsys):
     just_wrapped = sum(frame[0] - first < 2_020_000_000 for frame in frames)
     for name, count, status in (("short", just_wrapped, 0), ("long", len(frames), 2)):
         log = tmp_path / f"{name}.log"
-        with log.open("w") as stream:
-            write_candump(stream, [[((f[0] - first) % 10**9, f[1], f[2], f[3]) for f in frames[:count]]])
+        write_log(log, [((f[0] - first) % 10**9, f[1], f[2], f[3]) for f in frames[:count]])
         assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == status
     said = capsys.readouterr()
     assert "the log's clock leaps back by" in said.out
@@ -117,14 +113,13 @@ def test_stamps_that_wrap_each_second_are_refused_or_told(tmp_path, capsys):
 def test_a_short_log_in_reverse_is_refused(tmp_path, count):
     frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch][:count]
     log = tmp_path / "ride.log"
-    with log.open("w") as stream:
-        write_candump(stream, [frames[::-1]])
+    write_log(log, frames[::-1])
     with pytest.raises(InputError, match="its last frame is not after its first; sort its frames by time"):
         read_samples(log, read_vehicle("reference"))
 
 
 def test_what_a_log_holds_says_that_its_time_runs_back(tmp_path, capsys):
-    log = restamped(tmp_path / "ride.blf", lambda n, time: time if n < 16_000 else 90_000_000_000 - time)
+    log = restamped(tmp_path / "ride.mcap", lambda n, time: time if n < 16_000 else 90_000_000_000 - time)
     assert cli.main(["export", str(log)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"^  time +1 min 00 s from 2025-06-15 15:06:40 UTC$", said, re.M)
@@ -132,7 +127,7 @@ def test_what_a_log_holds_says_that_its_time_runs_back(tmp_path, capsys):
 
 
 def test_single_frames_ahead_of_all_others_do_not_move_time(tmp_path, capsys):
-    log = restamped(tmp_path / "ride.blf", lambda n, time: time + 9_000_000_000 * (n % 500 == 250))
+    log = restamped(tmp_path / "ride.mcap", lambda n, time: time + 9_000_000_000 * (n % 500 == 250))
     ride, _ = estimated(log, capsys)
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
@@ -143,5 +138,5 @@ def test_single_frames_ahead_of_all_others_do_not_move_time(tmp_path, capsys):
 
 
 def test_the_other_tools_read_such_a_log(tmp_path):
-    samples = read_samples(leaping(tmp_path / "leap.blf", -YEARS), read_vehicle("reference"))
+    samples = read_samples(leaping(tmp_path / "leap.mcap", -YEARS), read_vehicle("reference"))
     assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)

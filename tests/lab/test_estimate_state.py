@@ -28,10 +28,9 @@ from gz_onboard.lab.estimate_order import span_of
 from gz_onboard.lab.estimate_ride import open_estimate
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.logs import read_frames
-from gz_onboard.recording.writers import write_blf
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.lab.short_logs import short_log
-from tests.support import S, identifier, recorded, reference, with_cell_voltages
+from tests.support import S, identifier, recorded, reference, with_cell_voltages, write_log
 
 DAY = 86_400 * S
 CUTS = {"a": (0.0, 60.0), "b": (70.0, 130.0), "c": (170.0, 220.0)}  # s of a ride, each a ride of its own
@@ -55,8 +54,7 @@ def rides(cuts: dict[str, list[Frame]], tmp_path_factory: pytest.TempPathFactory
     """A folder with the log of each cut, whose names are not in the order of their times."""
     folder = tmp_path_factory.mktemp("rides")
     for name, frames in cuts.items():
-        with (folder / f"{'cab'['abc'.index(name)]}.blf").open("wb") as stream:
-            write_blf(stream, [frames])
+        write_log(folder / f"{'cab'['abc'.index(name)]}.blf", frames)
     return folder
 
 
@@ -154,9 +152,8 @@ def test_it_is_as_of_a_daemon_that_is_restarted(kept, cuts, tmp_path, monkeypatc
     """Each goes on where the other ended: the daemon rides the first, `estimate` the second, the daemon the third."""
     file = tmp_path / "s.json"
     by_the_daemon(cuts["a"], file, monkeypatch)
-    log = tmp_path / "second.blf"
-    with log.open("wb") as stream:
-        write_blf(stream, [cuts["b"]])
+    log = tmp_path / "second.mcap"
+    write_log(log, cuts["b"])
     assert estimate(tmp_path, log) == 0
     same(snapshot(file), snapshot(kept / "s.previous.json"))
     by_the_daemon(cuts["c"], file, monkeypatch)
@@ -208,12 +205,11 @@ def test_what_was_restored_is_as_old_as_the_first_voltage_finds_it(kept, cuts, t
     silent = [identifier("BMS_Pack"), identifier("INV_Power")]
     moved = [(begin + t - cuts["c"][0][0], *rest) for t, *rest in cuts["c"]]
     late: list[Frame] = [f for f in moved if f[0] > begin + 20 * S or f[1] not in silent]
-    with (tmp_path / "late.blf").open("wb") as stream:
-        write_blf(stream, [late])
+    write_log(tmp_path / "late.mcap", late)
     (tmp_path / "daemon").mkdir()
     for file in (tmp_path / "s.json", tmp_path / "daemon" / "s.json"):
         shutil.copy(kept / "s.previous.json", file)
-    assert estimate(tmp_path, tmp_path / "late.blf") == 0
+    assert estimate(tmp_path, tmp_path / "late.mcap") == 0
     by_the_daemon(late, tmp_path / "daemon" / "s.json", monkeypatch)
     same(snapshot(tmp_path / "s.json"), snapshot(tmp_path / "daemon" / "s.json"))
 
@@ -232,8 +228,7 @@ def test_a_log_that_was_cut_in_two_is_two_rides(cuts, tmp_path, capsys):
     """Where it was cut, frames of two channels overtake each other by a little."""
     frames = cuts["c"][:4000]
     for name, part, moved in (("x", frames[:2000], 20 * 10**6), ("y", frames[2000:], 0)):
-        with (tmp_path / f"{name}.blf").open("wb") as stream:
-            write_blf(stream, [[*part[:-1], (part[-1][0] + moved, *part[-1][1:])]])
+        write_log(tmp_path / f"{name}.blf", [*part[:-1], (part[-1][0] + moved, *part[-1][1:])])
     assert estimate(tmp_path, tmp_path) == 0
     rides = json.loads((tmp_path / "said.json").read_text())["rides"]
     assert [ride["saved_state_age_s"] for ride in rides] == [None, 0.0]
@@ -242,9 +237,8 @@ def test_a_log_that_was_cut_in_two_is_two_rides(cuts, tmp_path, capsys):
 def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
     frames = cuts["c"]
     begin, half = frames[0][0], frames[len(frames) // 2][0]
-    with (tmp_path / "set.blf").open("wb") as stream:
-        write_blf(stream, [[(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames]])
-    span = span_of(tmp_path / "set.blf", reference())
+    write_log(tmp_path / "set.mcap", [(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames])
+    span = span_of(tmp_path / "set.mcap", reference())
     assert span.end_ns == frames[-1][0]
     assert span.begin_ns == pytest.approx(begin, abs=0.1 * S)
 
@@ -279,9 +273,8 @@ def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
     (out := tmp_path / "out").mkdir()
     assert estimate(out, short, options=["--vehicle-id", "17"]) == 0
     later = tmp_path / "later.blf"
-    with later.open("wb") as stream:
-        frames = [frame for batch in read_frames(short) for frame in batch]
-        write_blf(stream, [[(t + 600 * S, i, data, channel) for t, i, data, channel in frames]])
+    frames = [frame for batch in read_frames(short) for frame in batch]
+    write_log(later, [(t + 600 * S, i, data, channel) for t, i, data, channel in frames])
     assert "effects: ['reference-scooter-17'] saved, ['reference-scooter-18'] in" in refused(
         out, capsys, later, options=["--vehicle-id", "18"]
     )
@@ -298,9 +291,8 @@ def test_a_signal_shows_which_vehicle_it_is(short, tmp_path):
     frames = [frame for batch in read_frames(short) for frame in batch]
     begin = frames[0][0]
     for number, shown in ((17, "-17"), (None, "")):
-        with (log := tmp_path / "numbered.blf").open("wb") as stream:
-            own = [] if number is None else [(begin + S, 1911, number.to_bytes(4, "little"), 0)]
-            write_blf(stream, [sorted([*frames, *own])])
+        own = [] if number is None else [(begin + S, 1911, number.to_bytes(4, "little"), 0)]
+        write_log(log := tmp_path / "numbered.blf", sorted([*frames, *own]))
         ride = open_estimate(log, read_vehicle(file))
         assert ride.vehicle.name == f"reference-scooter{shown}"
         assert len(ride.frames) == len(frames) + len(own)
@@ -317,8 +309,7 @@ def test_what_does_not_go_together(short, tmp_path, capsys):
     )
     assert "--jobs 2 with --state" in refused(out, capsys, short, options=["--jobs", 2])
     undated = tmp_path / "undated.blf"
-    with undated.open("wb") as stream:
-        write_blf(stream, [[(t % DAY, *rest) for t, *rest in recorded("coastdown", 0, 5)]])  # type: ignore[misc]
+    write_log(undated, [(t % DAY, *rest) for t, *rest in recorded("coastdown", 0, 5)])  # type: ignore[misc]
     assert f"{undated}: has no date" in refused(out, capsys, undated, short)
     assert "ends in .json" in refused(out, capsys, short, options=["--state", "s.blf"])
     assert "would overwrite the input" in refused(out, capsys, short, options=["--state", short])
@@ -390,8 +381,7 @@ def test_a_month_later_only_the_new_ride_is_estimated(kept, rides, cuts, tmp_pat
         shutil.copy(rides / f"{name}.blf", tmp_path)
     (tmp_path / "bad.blf").write_bytes(b"no log")
     begin = cuts["a"][0][0] + DAY // 2
-    with (tmp_path / "other.blf").open("wb") as stream:
-        write_blf(stream, [[(begin + i * S, 0x7F, b"x", 0) for i in range(9)]])
+    write_log(tmp_path / "other.blf", [(begin + i * S, 0x7F, b"x", 0) for i in range(9)])
     assert estimate(tmp_path, tmp_path) == 2
     assert "knows none of its 9 frames" in capsys.readouterr().err
     assert (tmp_path / "s.json").read_bytes() == (kept / "s.previous.json").read_bytes()

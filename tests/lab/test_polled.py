@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.cli import main
-from gz_onboard.recording.writers import write_candump
 from tests.polled import CHARGE, KONA, polled_ride
+from tests.support import write_log
 
 SECONDS = 30
 
@@ -18,8 +18,7 @@ SECONDS = 30
 @pytest.fixture(scope="module")
 def ride(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("polled") / "ride.log"
-    with file.open("w") as text:
-        write_candump(text, [polled_ride(SECONDS)])
+    write_log(file, polled_ride(SECONDS))
     return file
 
 

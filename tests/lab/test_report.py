@@ -22,8 +22,7 @@ from gz_onboard.lab.report_svg import GRAIN, axis_of, band, draw_map, line, stre
 from gz_onboard.lab.why import Why
 from gz_onboard.offline.samples import Samples
 from gz_onboard.recording.logs import read_frames
-from gz_onboard.recording.writers import write_candump
-from tests.support import LOGS
+from tests.support import LOGS, write_log
 
 VALUES = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60)
 
@@ -143,8 +142,7 @@ def test_a_log_of_several_names_is_one_ride_and_that_is_said(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     frames = next(read_frames(LOGS / "coastdown.blf"))
     for name, part in (("one.log", frames[:-1]), ("other.log", frames[1:])):
-        with Path(name).open("w") as stream:
-            write_candump(stream, [part])
+        write_log(Path(name), part)
     shutil.copy("one.log", "copy.log")
     Path("link.log").symlink_to("one.log")
     given = ["one.log", "one.log", "copy.log", "link.log", str(tmp_path / "one.log"), "other.log"]

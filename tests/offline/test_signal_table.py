@@ -21,6 +21,7 @@ from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.logs import read_samples as logged_samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import events_of
+from tests.support import write_log
 
 REFERENCE = read_vehicle("reference")
 TLMOTO = Path(__file__).resolve().parents[1] / "vehicles" / "tlmoto"
@@ -246,10 +247,8 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     lines = ["time [s]," + ",".join(f"{role} [{UNITS[role]}]" for role in roles)]
     lines += [f"{start * 1e-9 + t:.6f}," + ",".join(str(row.get(r, "")) for r in roles) for t, row in rows.items()]
     (tmp_path / "table.csv").write_text("\n".join(lines))
-    from gz_onboard.recording.writers import write_candump
 
-    with (tmp_path / "frames.log").open("w") as stream:
-        write_candump(stream, [head])
+    write_log(tmp_path / "frames.log", head)
     ours, theirs = (estimate(tmp_path, tmp_path / name) for name in ("table.csv", "frames.log"))
     for key in ("soc_end", "soc_end_sd", "distance_km", "energy_wh", "range_end_km", "innovation_rms_v"):
         assert ours[key] == pytest.approx(theirs[key], rel=2e-3), key

@@ -27,7 +27,7 @@ from gz_onboard.recording.logs import json_channels, read_attachments, read_fram
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.readers.python_can import frame_of
 from gz_onboard.recording.readers.text import ChannelNumbers
-from gz_onboard.recording.writers import write_blf, write_candump
+from tests.support import write_log
 
 START_S = 1_750_000_000
 
@@ -152,7 +152,7 @@ def test_a_blf_of_other_tools_is_read(tmp_path: Path) -> None:
     assert same(whole(path), by_python_can(path), 600)
 
 
-# --- our own formats, exact to the ns and µs -------------------------------------------------------------------
+# --- our own format, exact to the ns ---------------------------------------------------------------------------
 
 ns_frames = st.lists(
     st.tuples(
@@ -169,25 +169,6 @@ ns_frames = st.lists(
 
 
 @given(ns_frames)
-def test_blf_keeps_nanoseconds(frames: list[Frame]) -> None:
-    with TemporaryDirectory() as directory:
-        path = Path(directory) / "a.blf"
-        with path.open("wb") as stream:
-            assert write_blf(stream, [frames]) == len(frames)
-        assert whole(path) == frames
-        assert same(by_python_can(path), frames, 1000)
-
-
-@given(ns_frames)
-def test_candump_keeps_microseconds(frames: list[Frame]) -> None:
-    with TemporaryDirectory() as directory:
-        path = Path(directory) / "a.log"
-        with path.open("w") as stream:
-            assert write_candump(stream, [frames]) == len(frames)
-        assert whole(path) == [(t // 1000 * 1000, i, d, c) for t, i, d, c in frames]
-
-
-@given(ns_frames)
 def test_mcap_keeps_everything(frames: list[Frame]) -> None:
     with TemporaryDirectory() as directory:
         path = Path(directory) / "a.mcap"
@@ -197,9 +178,7 @@ def test_mcap_keeps_everything(frames: list[Frame]) -> None:
 
 def test_error_frames_keep_their_class_in_a_candump(tmp_path: Path) -> None:
     frames: list[Frame] = [(10**15, 0x44 | ERR_FLAG, bytes(8), 0)]
-    with (tmp_path / "a.log").open("w") as stream:
-        write_candump(stream, [frames])
-    assert whole(tmp_path / "a.log") == frames
+    assert whole(write_log(tmp_path / "a.log", frames)) == frames
 
 
 def write_mcap(path: Path, batches: list[list[Frame]]) -> None:
@@ -214,19 +193,16 @@ def write_mcap(path: Path, batches: list[list[Frame]]) -> None:
 
 
 def ordinary(count: int) -> list[Frame]:
-    return [(START_S * 10**9 + i * 2_000_000, 0x100 + i % 20, i.to_bytes(4, "little") * 2, 0) for i in range(count)]
+    """Frames whose times are whole µs and exact as a float of seconds: no format changes them."""
+    return [(START_S * 10**9 + i * 15_625_000, 0x100 + i % 20, i.to_bytes(4, "little") * 2, 0) for i in range(count)]
 
 
 def written(tmp_path: Path, frames: list[Frame], suffix: str) -> Path:
     path = tmp_path / f"log{suffix}"
     if suffix == ".mcap":
         write_mcap(path, [frames[i : i + 1000] for i in range(0, len(frames), 1000)])
-    elif suffix == ".blf":
-        with path.open("wb") as stream:
-            write_blf(stream, [frames])
     else:
-        with path.open("w") as text:
-            write_candump(text, [frames])
+        write_log(path, frames)
     return path
 
 
@@ -435,8 +411,7 @@ def test_a_database_of_python_can_is_refused_with_what_converts_it(tmp_path: Pat
 
 def test_frames_that_no_bus_carries_are_dropped_and_counted(tmp_path: Path) -> None:
     path = tmp_path / "a.blf"
-    with path.open("wb") as stream:
-        write_blf(stream, [[(START_S * 10**9 + i, identifier, b"1", 0) for i, identifier in enumerate((0x7FF, 0x800))]])
+    write_log(path, [(START_S * 10**9 + i, identifier, b"1", 0) for i, identifier in enumerate((0x7FF, 0x800))])
     there, damages = read(path)
     assert [frame[1] for frame in there] == [0x7FF]
     assert [(damage.count, damage.reason) for damage in damages] == [(1, "identifier 800 has more than 11 bits")]

@@ -18,8 +18,7 @@ from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording import replay as command
 from gz_onboard.recording.readers.python_can import frame_of
 from gz_onboard.recording.replay import Sent, bus_sender, replay
-from gz_onboard.recording.writers import write_candump
-from tests.support import HEARS_CTRL_C
+from tests.support import HEARS_CTRL_C, write_log
 
 START = 1_750_000_000_000_000_000
 
@@ -30,8 +29,7 @@ def frames(count: int, step_ns: int = 5_000_000) -> list[Frame]:
 
 def log(tmp_path: Path, content: list[Frame]) -> Path:
     path = tmp_path / "a.log"
-    with path.open("w") as stream:
-        write_candump(stream, [content])
+    write_log(path, content)
     return path
 
 

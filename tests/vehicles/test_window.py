@@ -59,7 +59,7 @@ def test_the_vehicles_own_state_of_charge_is_that_of_the_window(tmp_path):
     group = Group("Battery", ("bms_state_of_charge", "pack_voltage"), 0.1)
     e = EventEstimator([group], vehicle.pack, vehicle.model, vehicle.riding)
     e.handle((0.0, 0, (0.8, 26.0)))
-    e.close(0.1)
+    e.close()
     assert e.signals.bms_state_of_charge.value == pytest.approx(LOW + 0.8 * (HIGH - LOW))
 
 

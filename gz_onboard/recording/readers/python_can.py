@@ -194,7 +194,7 @@ def message_of(frame: Frame, *, with_time: bool = True) -> can.Message:
     time_ns, identifier, data, channel = frame
     remote = bool(identifier & RTR_FLAG)
     return can.Message(
-        timestamp=time_ns * 1e-9 if with_time else 0.0,
+        timestamp=time_ns / 1_000_000_000 if with_time else 0.0,
         arbitration_id=identifier & MOST_EXTENDED,
         is_extended_id=bool(identifier & EFF_FLAG),
         is_remote_frame=remote,
