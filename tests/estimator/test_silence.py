@@ -123,6 +123,7 @@ def test_what_flowed_in_a_pause_is_covered(gap, speed):
     e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
     scooter.away(gap, speed)
     e.handle(next(scooter.live(0.1, speed)))
+    e.close()
     assert abs(e.filter.soc - scooter.soc) < 2 * e.filter.covariance[0] ** 0.5
 
 
