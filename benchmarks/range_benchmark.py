@@ -147,8 +147,8 @@ def follow(
     if state:
         pipeline.estimator.restore(state, KEY, NIGHT)
     if route:
-        ahead = pipeline.estimator.ahead
-        ahead.follow(ahead.ready(read_route(route)))
+        forecaster = pipeline.estimator.route
+        forecaster.follow(forecaster.prepare(read_route(route)))
     first: int | None = None  # ns
     for frames in read_frames(log):
         first = frames[0][0] if first is None else first

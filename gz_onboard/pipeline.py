@@ -195,7 +195,7 @@ class Pipeline:
     def _sample(self, log: Log, time_ns: int, estimate: Estimate) -> None:
         log.sample(ESTIMATE_TOPIC, time_ns, estimate_row(estimate))
         log.sample(STATUS_TOPIC, time_ns, self.status())
-        for change, why in self.estimator.attribution.news():
+        for change, why in self.estimator.explainer.news():
             log.sample(CHANGE_TOPIC if change else WHY_TOPIC, time_ns, explanation_row(why))
         if estimate.battery_ends_latitude is not None and estimate.battery_ends_longitude is not None:
             there = estimate.battery_ends_latitude, estimate.battery_ends_longitude

@@ -37,13 +37,13 @@ def test_a_route_is_given_asked_for_and_cleared(listening, pipeline):
     it, path = listening
     assert stat.S_IMODE(path.stat().st_mode) == 0o660
     assert ask(path, {"route": WAY}) == {"ok": True, "route": "home", "length_m": 980, "grade_known": True}
-    assert pipeline.estimator.ahead.answer.state == RouteState.NONE  # the loop has not been there
+    assert pipeline.estimator.route.outlook.route_state == RouteState.NONE  # the loop has not been there
     it.take()
-    assert pipeline.estimator.ahead.answer.state == RouteState.OFF  # given, not yet known to be on it
+    assert pipeline.estimator.route.outlook.route_state == RouteState.OFF  # given, not yet known to be on it
     assert ask(path, {"status": True})["route"] == "home"
     assert ask(path, {"route": None}) == {"ok": True, "route": None}
     it.take()
-    assert pipeline.estimator.ahead.answer.state == RouteState.NONE
+    assert pipeline.estimator.route.outlook.route_state == RouteState.NONE
 
 
 @pytest.mark.parametrize(
@@ -59,11 +59,11 @@ def test_a_route_is_given_asked_for_and_cleared(listening, pipeline):
         (b'{"route": {"distance_m": [0]}}', "route: has 1 points"),
         (b'{"route": {"distance": [0, 1]}}', r"unknown list 'distance' \(did you mean 'distance_m'\?\)"),
         (b'{"route": {"distance_m": 3}}', "route: distance_m: must be a list of numbers, is 3.0"),
-        (b'{"route": {"distance_m": [0, "a"]}}', "route, point:2: distance_m: must be a finite number, is 'a'"),
-        (b'{"route": {"distance_m": [0, NaN]}}', "route, point:2: distance_m: must be a finite number, is nan"),
-        (b'{"route": {"distance_m": [0, 1%s]}}' % (b"0" * 400), "route, point:2: distance_m: must be a finite number"),
+        (b'{"route": {"distance_m": [0, "a"]}}', "route, point 2: distance_m: must be a finite number, is 'a'"),
+        (b'{"route": {"distance_m": [0, NaN]}}', "route, point 2: distance_m: must be a finite number, is nan"),
+        (b'{"route": {"distance_m": [0, 1%s]}}' % (b"0" * 400), "route, point 2: distance_m: must be a finite number"),
         (b'{"route": {"distance_m": [0, 20], "altitude_m": [0]}}', "its lists must be of one length"),
-        (b'{"route": {"distance_m": [0, 20, 10]}}', "route, point:3: distance_m: 10 m does not increase"),
+        (b'{"route": {"distance_m": [0, 20, 10]}}', "route, point 3: distance_m: 10 m does not increase"),
         (b'{"route": {"altitude_m": [0, 20]}}', "needs column distance_m, or latitude_deg"),
         (b'{"route": {"distance_m": [0, 20], "name": 3}}', "name: must be a text"),
     ],
@@ -73,7 +73,7 @@ def test_what_is_wrong_is_named_and_changes_nothing(line, message, pipeline):
     with pytest.raises(InputError, match=message):
         it.answer(line)
     it.take()
-    assert pipeline.estimator.ahead.answer.state == RouteState.NONE
+    assert pipeline.estimator.route.outlook.route_state == RouteState.NONE
 
 
 def test_clients_that_stall_or_flood_are_left(listening, monkeypatch):

@@ -278,7 +278,7 @@ def without_states(snapshot: Snapshot) -> None:
 def learned() -> Snapshot:
     """What five seconds of riding have taught, with a bias that no fresh estimator has."""
     estimator = ridden(Scooter().steady(5.0)).pipeline.estimator
-    estimator.road.bias_x = 0.01
+    estimator.motion.gyro_bias = 0.01, 0.0
     snapshot = estimator.snapshot(reference().key)
     assert snapshot is not None
     return snapshot
@@ -286,7 +286,7 @@ def learned() -> Snapshot:
 
 def is_fresh(daemon: Daemon) -> bool:
     ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
-    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours.soc.saved is None
+    return ours.snapshot("") == new.snapshot("") is None and ours.motion == new.motion and ours.soc.saved is None
 
 
 @pytest.mark.parametrize(
@@ -382,7 +382,7 @@ def test_whatever_restoring_raises_it_begins_afresh(
     state.write(file, state.encode(learned, time.time()))
 
     def half(self: Estimator, *_: object) -> None:
-        self.road.bias_x = 7.0
+        self.motion.gyro_bias = 7.0, 0.0
         raise ZeroDivisionError("in the middle")
 
     monkeypatch.setattr(Estimator, "restore", half)

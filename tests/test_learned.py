@@ -108,7 +108,7 @@ def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, cap
     snapshot, _ = state.load(saved, time.time()) or ({}, None)
     estimator.restore(snapshot, vehicle.key, 0.0)
     estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
-    estimator.weakest.known.joint.means[:2] = [0.04, 1 / 0.9 - 1]
+    estimator.weakest.known = replace(estimator.weakest.known, means=(0.04, 1 / 0.9 - 1, 0.0, 0.0))
     changed = estimator.snapshot(vehicle.key)
     assert changed
     state.write(saved, state.encode(changed, time.time()))

@@ -24,7 +24,7 @@ from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
 from gz_onboard.progress import Progress
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 
 
@@ -76,7 +76,7 @@ def estimate(
     on from, if there is one, and to save after the ride; it must have been saved before the ride began. progress: takes
     numbers of frames. Raises InputError.
     """
-    road = None if route is None else read_ahead(Path(route))[1]
+    road = None if route is None else read_route(Path(route))
     how, log = How(filter_name, route=road), KeptRows()
     given, known = source_of(source), vehicle_of(vehicle)
     if state is None:

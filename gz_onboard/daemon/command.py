@@ -25,7 +25,7 @@ from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.effect import ROOT
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking, range_publisher
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOG_TOTAL_MB = 1e-3, 1e9  # bounds of the option
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
-    route = read_ahead(arguments.route)[1] if arguments.route else None
+    route = read_route(arguments.route) if arguments.route else None
     recorder = _recorder(arguments, vehicle) if arguments.log_dir else None
     identifiers = None if arguments.all_frames else known_identifiers(vehicle.mapping)
     if identifiers is not None:  # our own too: another sender of them is reported

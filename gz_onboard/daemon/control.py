@@ -19,10 +19,10 @@ from queue import SimpleQueue
 from typing import Any
 
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.estimator.route_ahead import Road
+from gz_onboard.estimator.route import PreparedRoute
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.routes.columns import LEAST_ROWS, Columns
-from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
+from gz_onboard.routes.columns import MIN_ROWS, Columns
+from gz_onboard.routes.route import ROUTE_COLUMNS, Route, route_of
 
 MAX_REQUEST_BYTES = 8_000_000  # twice a route of the most points with all columns
 TIMEOUT_S = 5.0  # of each read and write
@@ -38,7 +38,7 @@ class Control:
 
     def __init__(self, path: Path | None, pipeline: Callable[[], Pipeline]) -> None:
         self._path, self._pipeline = path, pipeline
-        self._ready: SimpleQueue[Road | None] = SimpleQueue()  # for the daemon's loop to take
+        self._ready: SimpleQueue[PreparedRoute | None] = SimpleQueue()  # for the daemon's loop to take
         self._name: str | None = None
         self._server: _Server | None = None
 
@@ -59,7 +59,7 @@ class Control:
 
     def give(self, route: Route | None) -> None:
         """Prepare `route`, which may take seconds, for the daemon's loop to take; in any thread."""
-        road = self._pipeline().estimator.ahead.ready(route) if route else None
+        road = self._pipeline().estimator.route.prepare(route) if route else None
         self._name = route.name if route else None
         self._ready.put(road)
 
@@ -67,7 +67,7 @@ class Control:
         """Switch to the newest prepared route; called by the daemon's loop."""
         while not self._ready.empty():
             road = self._ready.get_nowait()
-            self._pipeline().estimator.ahead.follow(road)
+            self._pipeline().estimator.route.follow(road)
             log.info("route %s", "given" if road else "cleared")
 
     def close(self) -> None:
@@ -161,19 +161,20 @@ def route_of_request(request: object) -> Route:
     if not isinstance(name, str) or len(name) > LONGEST_NAME:
         raise InputError(f"route: name: must be a text of at most {LONGEST_NAME} letters, is {shown(name)}")
     for column, numbers in columns.items():
-        if column not in KNOWN_AHEAD:
-            known = ", ".join(KNOWN_AHEAD)
-            raise InputError(f"route: unknown list {shown(column)}{nearest(column, KNOWN_AHEAD)}; known are {known}")
+        if column not in ROUTE_COLUMNS:
+            known = ", ".join(ROUTE_COLUMNS)
+            raise InputError(f"route: unknown list {shown(column)}{nearest(column, ROUTE_COLUMNS)}; known are {known}")
         if not isinstance(numbers, list):
             raise InputError(f"route: {column}: must be a list of numbers, is {shown(numbers)}")
         for point, number in enumerate(numbers, start=1):
             if not isinstance(number, float) or not isfinite(number):
-                raise InputError(f"route, point:{point}: {column}: must be a finite number, is {shown(number)}")
+                raise InputError(f"route, point {point}: {column}: must be a finite number, is {shown(number)}")
     lengths = {column: len(numbers) for column, numbers in columns.items()}
     if len(set(lengths.values())) > 1:
         raise InputError(f"route: its lists must be of one length, are {shown(lengths)}")
     count = min(lengths.values(), default=0)
-    if count < LEAST_ROWS:
-        raise InputError(f"route: has {count} points, must have at least {LEAST_ROWS}")
+    if count < MIN_ROWS:
+        raise InputError(f"route: has {count} points, must have at least {MIN_ROWS}")
     values = {column: tuple(numbers) for column, numbers in columns.items()}
-    return route_ahead_of(Columns(Path("route, point"), tuple(range(1, count + 1)), values), name)
+    places = tuple(f"route, point {point + 1}" for point in range(count))
+    return route_of(Columns("route", places, values), name)

@@ -93,7 +93,7 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
     with _usable(file):
         snapshot, age = _load(file)
         check_vehicle(snapshot, vehicle.key)
-    fresh = {"battery": {"learned": new.learned_snapshot()}, "riding": {"riding": new.riding_snapshot()}}
+    fresh = {"battery": {"learned": new.learned_snapshot()}, "riding": {"riding": new.forecaster.snapshot()}}
     changed = dict(snapshot)
     for part in RESETS[what]:
         changed |= fresh[part]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gz_onboard.constants import WH
 from gz_onboard.errors import OK, InputError
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route_columns, route_name, route_of
 
 SOCKET = Path("/run/gz-onboard/control")
 TIMEOUT_S = 30.0  # for an answer: the daemon prepares a long route first
@@ -33,8 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.clear:
         request = {"route": None}
     elif arguments.file:
-        columns, route = read_ahead(arguments.file)
-        request = {"route": {"name": route.name[:100], **columns.values}}
+        columns = read_route_columns(arguments.file)
+        route_of(columns, "")  # what is wrong with it is said here, with the file's lines
+        request = {"route": {"name": route_name(arguments.file)[:100], **columns.values}}
     answer = ask(arguments.socket, request)
     if "error" in answer:
         raise InputError(f"{arguments.socket}: the daemon refused it: {answer['error']}")

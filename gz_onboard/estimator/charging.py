@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from gz_onboard.constants import HOUR
-from gz_onboard.estimator.activity import CHARGING_RATE
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.physics.battery import Battery
 
 CUT_OFF = 0.05  # 1/h: current over capacity at which chargers of lithium-ion cells end
@@ -53,7 +53,7 @@ class Charging:
         self._current += share * (-current - self._current)
         self.power = max(voltage * self._current, 0.0)
         # While less flows, as in a pause, it is not known when it is full.
-        flows = -current > CHARGING_RATE * battery.pack_capacity(temperature)
+        flows = -current > MOTION.charging_rate * battery.pack_capacity(temperature)
         self.to_full = time_to_full(battery, soc, self._current, temperature) if flows else None
 
     def end(self) -> None:

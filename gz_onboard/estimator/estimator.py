@@ -2,8 +2,8 @@
 
 No I/O and no clock: time arrives with the windows, so the same windows give the same estimates, to the last bit.
 All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
-check the sensors (`redundancy`), move on the road (`road`), choose the pack's voltage and current (`sources`) and the
-temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
+check the sensors (`redundancy`), follow the motion (`motion`), choose the pack's voltage and current (`sources`) and
+the temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
 """
 
 from __future__ import annotations
@@ -11,19 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gz_onboard.estimator.activity import Activities
-from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
+from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.model_inputs import ModelInputs
+from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
 from gz_onboard.estimator.outlook import Now, Outlook
-from gz_onboard.estimator.present import Present
 from gz_onboard.estimator.reasons import DEGRADING, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
 from gz_onboard.estimator.redundancy.electric import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
-from gz_onboard.estimator.road import STANDSTILL, RoadState
-from gz_onboard.estimator.route_ahead import RoadAhead
+from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import VERSION, check_snapshot
 from gz_onboard.estimator.soc import StateOfCharge
@@ -31,8 +30,7 @@ from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
 from gz_onboard.estimator.start import read_saved
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import COARSE, SLOWEST, MessageTiming
-from gz_onboard.estimator.vibration import VibrationMonitor
-from gz_onboard.estimator.weakest import Weakest
+from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import NO_PACK, STALE_PERIODS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
@@ -63,7 +61,7 @@ class Estimator:
         make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
-        self.road, self.forecaster = RoadState(), Forecaster(model, battery, riding)
+        self.motion, self.forecaster = Motion(), Forecaster(model, battery, riding)
         stale = [(role, group.period) for group in groups for role in group.roles]
         self.signals = Signals(
             ((role, STALE_PERIODS * period if period else DEFAULT_STALE) for role, period in stale),
@@ -71,8 +69,8 @@ class Estimator:
         )
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.attribution = Attribution(self.forecaster, self.signals)
-        self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
+        self.explainer = RangeExplainer(self.forecaster, self.signals)
+        self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         self._timing = MessageTiming(groups, self._slots)
@@ -83,8 +81,8 @@ class Estimator:
         self._odometer: float | None = None  # m, at the last step
         self._odometer_step = 0.0  # m, the largest of its counts; 0: it has not counted yet
         self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
-        self._activities, self._reading = Activities(), PackReading()
-        self._outlook = Outlook(self.forecaster, battery, self.ahead)
+        self._activity, self._reading = ActivityTracker(), PackReading()
+        self._outlook = Outlook(self.forecaster, battery, self.route)
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
@@ -92,8 +90,8 @@ class Estimator:
         self._sources = PackSources(self.signals, self.redundancy, battery, p)
         self._temperatures = Temperatures(self.signals, p)
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.redundancy.currents.sag)
-        self.forecaster.ageing, self.weakest = self.soc.ageing, Weakest(battery, self.signals, p)
-        self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
+        self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
+        self._inputs = ModelInputs(self.forecaster, self.motion, self._temperatures, self.soc, self._vibration)
 
     @property
     def filter(self) -> SocFilter | None:
@@ -102,7 +100,7 @@ class Estimator:
 
     def vibration(self, now: float) -> float:
         """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
-        return self._present.vibration(now)
+        return self._inputs.vibration(now)
 
     def ridden_by(self, rider: str) -> None:
         """`rider` rides from now on."""
@@ -128,18 +126,18 @@ class Estimator:
         if dt is None:
             return
         self._time = now
-        signals, road = self.signals, self.road
+        signals, motion = self.signals, self.motion
         elapsed = min(dt, self._timing.pause)
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
-        self.redundancy.step(StepInputs(now, dt, elapsed, signals, road.speed))
-        road.step(now, elapsed, signals, self._radius, self._gear)
+        self.redundancy.step(StepInputs(now, dt, elapsed, signals, motion.speed))
+        motion.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self._timing.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
-        self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
+        self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._inputs)
         self.weakest.step(now, self._reading, temperature, self.soc)
         self._follow_activity(now, dt)
         self._ride(now, dt)
@@ -154,15 +152,15 @@ class Estimator:
         A vehicle that moves at both ends of a gap has moved during it, and its odometer has counted the distance.
         """
         dt = 0.0 if self._time is None else now - self._time
-        odometer, speed = self.signals.odometer, self.road.speed or 0.0
+        odometer, speed = self.signals.odometer, self.motion.speed or 0.0
         moved = 0.0 if self._odometer is None else odometer.value - self._odometer
         if dt > LEAP and self._odometer_step and speed > MOVING:
             self._clock_leap = self._clock_leap or now
             came = odometer.time >= self._clock_leap - WINDOW
             if not came and now - self._clock_leap < ODOMETER_WITHIN:
                 return None
-            self.road.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
-            least = min(speed, self.road.speed or 0.0) * dt / 2
+            self.motion.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
+            least = min(speed, self.motion.speed or 0.0) * dt / 2
             if came and 0 <= moved + self._odometer_step < least:
                 dt, moved = max(now - self._clock_leap, WINDOW), 0.0
         elif 0 < moved < UNLEARNED:
@@ -175,21 +173,21 @@ class Estimator:
         cells = self._temperatures.cells_or_bench
 
         def road_power() -> float | None:
-            known = self.road.speed is not None and self._timing.sampled <= COARSE
-            return self._present.power(now) if known else None
+            known = self.motion.speed is not None and self._timing.sampled <= COARSE
+            return self._inputs.power(now) if known else None
 
         def error(voltage: float, current: float, sensor: str) -> float | None:
             return self.soc.cell_error(now, (voltage, current), sensor, cells)
 
         evidence = CellEvidence(error, road_power, self.soc.gate.rms)
-        reading = self._sources.read(now, dt, self.road.speed, evidence)
+        reading = self._sources.read(now, dt, self.motion.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
-        speed = self.road.speed
+        speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
         rides = speed is not None and abs(speed) > MOVING and dt < self._timing.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.soc.rest_voltage
-            return reading._replace(current=self._present.power(now) / voltage, source=CurrentSource.MODEL)
+            return reading._replace(current=self._inputs.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _compare_grades(self, now: float, dt: float) -> None:
@@ -199,17 +197,17 @@ class Estimator:
         towed = self.forecaster.riding.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
         before = grades.faulty
-        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
+        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._inputs.power_at(now, v, a))
         if grades.faulty != before:
-            self.road.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
+            self.motion.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
         left_out, self._distrusted = self._distrusted, self.redundancy.distrusted
         if self._distrusted == left_out:
             return
         newly = set(self._distrusted).difference(left_out)
-        learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
+        learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if forgotten := newly & learned:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
-            self.attribution.forget(forgotten)
+            self.explainer.forget(forgotten)
         if "auxiliary_current" in newly:
             self.forecaster.auxiliaries.forget()
         if newly & AGED_FROM:
@@ -222,36 +220,36 @@ class Estimator:
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
         capacity = self.battery.pack_capacity(self._temperatures.cells_or_bench)
         rate, drive = (None if x is None else x / capacity for x in (known, signals.inverter_current.get(now)))
-        rides = abs(self.road.speed or 0.0) > MOVING  # then nobody asks
+        rides = abs(self.motion.speed or 0.0) > MOVING  # then nobody asks
         silent = not rides and bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
-        if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
+        if rider is not None and abs(self.motion.speed or 0.0) < MOTION.standstill:
             self.ridden_by(f"{rider:g}")
-        speed = 0.0 if signals.carried else self.road.speed
-        self._activities.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
+        speed = 0.0 if signals.carried else self.motion.speed
+        self._activity.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
         self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
-        speed, reading = self.road.speed, self._reading
+        speed, reading = self.motion.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
-        known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
+        known = 0 < dt <= self._timing.pause and not unsure and self._activity.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
-            still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
+            still = 0.0 if dt <= self._timing.pause and self._activity.now is Activity.RIDING else dt
             self.forecaster.pause(still)
             return
         power = reading.voltage * reading.current
-        self.ahead.ride(dt, speed, power)
+        self.route.ride(dt, speed, power)
         learned = self.forecaster.ride(
             dt,
             speed,
-            self.road.grade,
+            self.motion.grade,
             power,
-            self._present.conditions(now, self.signals.motor_temperature.get(now)),
-            self._present.effect_inputs(now),
+            self._inputs.conditions(now, self.signals.motor_temperature.get(now)),
+            self._inputs.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
             self._drive(now, reading.voltage, power),
         )
@@ -271,24 +269,25 @@ class Estimator:
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
         lost = loss_variance(self._reasons(now) | self._missing.lacking)
-        conditions = self._present.conditions(now)
+        conditions = self._inputs.conditions(now)
         soc = self.soc.ageing.state_of_charge(filter_)
-        self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activities.now))
+        self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activity.now))
         if self._outlook.forecast:
-            of_road = self.road.distance, self.ahead.answer.hills
-            self.attribution.take(Moment(now, self._outlook.forecast, soc[0], conditions, *of_road))
+            charging = self._activity.now is Activity.CHARGING
+            way = self.motion.distance, self.route.hills
+            self.explainer.take(now, self._outlook.forecast, soc[0], conditions, *way, charging)
 
     # --- results ----------------------------------------------------------------------------------------------
 
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
-        road, filter_ = self.road, self.filter
-        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted, distance=road.distance)
+        motion, filter_ = self.motion, self.filter
+        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted, distance=motion.distance)
         silent = self._time is None or now - self._time > max(SILENT_AFTER, self._timing.pause)
-        estimate.activity = self._activities.shown(silent, self.soc.joined)
+        estimate.activity = self._activity.shown(silent, self.soc.joined)
         if not silent:
-            estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
-            estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
+            estimate.speed, estimate.acceleration, estimate.grade = motion.speed, motion.acceleration, motion.grade
+            estimate.lean, estimate.yaw_rate, estimate.heading = motion.lean, motion.yaw_rate, motion.heading
             self._reading.report(estimate)
             estimate.innovation = self.soc.gate.innovation
         estimate.cell_temperature = self._temperatures.cells
@@ -300,7 +299,7 @@ class Estimator:
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self._outlook.report(estimate)
-        estimate.why = self.attribution.latest if self._outlook.forecast else None
+        estimate.why = self.explainer.latest if self._outlook.forecast else None
         reasons = int(estimate.reasons)  # plain numbers: ten times a second flags take longer than all of the above
         estimate.state = State.DEGRADED if reasons & int(DEGRADING) else State.VALID
         missing = reasons | int(self._missing.lacking)
@@ -310,7 +309,7 @@ class Estimator:
 
     def _reasons(self, now: float) -> Reason:
         s = self.signals
-        reasons = self._missing.reasons(now, self._activities.takes_charge or s.carried)
+        reasons = self._missing.reasons(now, self._activity.takes_charge or s.carried)
         if self._sources.currents_differ:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
@@ -335,18 +334,14 @@ class Estimator:
             "key": key,
             "consumption": self._outlook.consumption,
             "cell_temperature": self._temperatures.cells,
-            "gyro_bias": [self.road.bias_x, self.road.bias_z],
-            "riding": self.riding_snapshot(),
+            "gyro_bias": list(self.motion.gyro_bias),
+            "riding": self.forecaster.snapshot(),
             "learned": self.learned_snapshot(),
         }
 
     def learned_snapshot(self) -> dict[str, Any]:
         """What was learned of the pack's age, as part of the saved state."""
         return {**self.soc.ageing.snapshot(), "weakest": self.weakest.snapshot()}
-
-    def riding_snapshot(self) -> dict[str, Any]:
-        """What was learned of the riding, as part of the saved state."""
-        return self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()}
 
     def wait(self, seconds: float) -> None:
         """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
@@ -359,10 +354,10 @@ class Estimator:
         """
         check_snapshot(saved, key)
         self.forecaster.restore(saved["riding"])
-        self.ahead.restore(saved["riding"]["on_routes"])
         self.soc.ageing.restore(saved["learned"])
         self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))
-        self.road.bias_x, self.road.bias_z = saved["gyro_bias"]
+        bias_x, bias_z = saved["gyro_bias"]
+        self.motion.gyro_bias = bias_x, bias_z
         if saved["cell_temperature"] is not None and age is not None and age < CELLS_KEEP:
             self._temperatures.cells = saved["cell_temperature"]
         self.soc.restore(read_saved(saved), age, self.soc.effects.read(saved["cell_effects"]))

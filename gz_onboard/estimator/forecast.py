@@ -23,12 +23,12 @@ from math import hypot, inf, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY, HOUR
-from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.auxiliaries import Auxiliaries
 from gz_onboard.estimator.calm import Calm, restored_calm
 from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import (
     KEPT,
@@ -83,7 +83,6 @@ FIELDS = {
     "states": Each(FINITE, 100),
     "terrain": dict.fromkeys((part.name for part in fields(Terrain)), FINITE),
     "auxiliaries": {"mean": Number(-1e5, 1e5), "filed": FINITE},  # W
-    "on_routes": Each(Number(0.0, 1e12, optional=True), 2),
 }
 """Of the saved state: what was learned of the riding."""
 
@@ -201,10 +200,10 @@ class Forecaster:
             segment.level += to_come
         else:
             self._stand(r.second.seconds)
-            if r.still <= STOP_TIME:
+            if r.still <= MOTION.stop_time:
                 segment.standing += r.second.energy
                 segment.beside_standing += self.auxiliaries.now * r.second.seconds
-        if r.still <= STOP_TIME:
+        if r.still <= MOTION.stop_time:
             segment.duration += r.second.seconds
             segment.squares += r.second.squares
         segment.level -= stored

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from gz_onboard.estimator.charging import Charging
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.route_ahead import Pack, RoadAhead
+from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.sources import PackReading
 from gz_onboard.events import Activity, Estimate, Reason
 from gz_onboard.physics.battery import Battery
@@ -36,9 +36,9 @@ class Now(NamedTuple):
 class Outlook:
     """Makes a forecast each second, and keeps it."""
 
-    def __init__(self, forecaster: Forecaster, battery: Battery, road: RoadAhead) -> None:
+    def __init__(self, forecaster: Forecaster, battery: Battery, route: RouteForecaster) -> None:
         self.forecast: Forecast | None = None
-        self._forecaster, self._battery, self._road = forecaster, battery, road
+        self._forecaster, self._battery, self._route = forecaster, battery, route
         self._charging = Charging()
         self._full: Forecast | None = None  # while it is charged
         self._time, self._soc = -inf, 0.0  # of the last forecast
@@ -62,14 +62,14 @@ class Outlook:
         elapsed, self._time = min(now.time - self._time, LONGEST), now.time
         known = now.temperature, now.temperature_sd, now.conditions.ambient, now.conditions.altitude
         free = self._forecaster.forecast(now.soc, now.soc_sd, *known, now.loss_variance)
-        pack = Pack(now.soc, now.soc_sd, now.loss_variance)
         voltage, current = now.reading.voltage, now.reading.current
         charging = now.activity is Activity.CHARGING
         if abs(now.soc - self._soc) > BEGUN_ANEW * self._soc > 0:
             self._forecaster.calm.show_next()
         self._soc = now.soc
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
-        self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
+        along = self._route.forecast(now.time, free, (now.soc, now.soc_sd), now.loss_variance, now.conditions)
+        self.forecast = self._forecaster.shown(along, drawn)
         self._factor = self._forecaster.factor, sqrt(self._forecaster.riding.factor_variance)
         if charging and voltage and current is not None:
             self._charging.step(elapsed, self._battery, (voltage, current), now.soc, now.temperature)
@@ -80,7 +80,7 @@ class Outlook:
 
     def report(self, estimate: Estimate) -> None:
         """Write into `estimate` what was forecast."""
-        self._road.report(estimate)
+        self._route.report(estimate)
         forecast = self.forecast
         if forecast is None:
             return

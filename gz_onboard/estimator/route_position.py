@@ -1,163 +1,163 @@
-"""Where on a route the vehicle is.
+"""Where on a route the vehicle is, and whether the route's hills are those that are ridden.
 
-With a receiver and a route that has positions, it is followed by both: the distance ridden says where it ought to be
-by now, and the nearest place of the route around there draws it nearer. So roads that the route takes twice, loops
-and turning back do not make it jump. `FAR` off for `LEAVING` on, or riding against the route for so long, and it is
-off the route. Then all of the route is searched for the place that it is at, in the route's direction; of several,
-that which is nearest to where the distance ridden since would have led.
+With a receiver and a route that has positions it is followed by both: the distance ridden says where the vehicle should
+be by now, and the nearest place of the route around there corrects that. So roads that the route takes twice, loops and
+turning back do not make it jump. After some way off the route, or against its direction, the vehicle has left it. Then
+all of the route is searched for the place that it is at, in the route's direction; of several, the one nearest to where
+the distance ridden since would have led.
 
 Without either, it is where the distance ridden since the route was given says.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections import defaultdict
 from dataclasses import dataclass
-from itertools import pairwise
-from math import atan2, cos, hypot, pi, radians
+from math import cos, exp, inf, pi, radians
+from typing import TYPE_CHECKING
 
 from gz_onboard.routes.route import Route
 
-FAR = 50.0  # m from the route: a receiver in a town and a map are off by 20 m together
-LEAVING = 60.0  # m off the route before that is believed: receivers err for seconds
-JOINING = 30.0  # m from the route, to be taken as on it again
-STAYING, STAYING_AFAR = 40.0, 300.0  # m on it, before that is believed; where it would be a leap along the route
-LEAP = 500.0  # m, and what was ridden off the route: what is farther along is a leap
-AROUND, PER_METRE = 80.0, 0.05  # m to both sides of where it ought to be, and more for each since it was last seen
-LONGITUDINAL = 5.0  # so much less a metre along the route counts than one beside it
-GAIN = 0.3  # share of the difference along the route that one fix mends
-AGAINST = 2.0  # rad between the course and the route's heading: ridden the other way
-DEGREE = 111_200.0  # m of latitude; 0.3 % off at most, over some hundred metres
-CELL = 200.0  # m: of the grid in which pieces of the route are looked up
+if TYPE_CHECKING:
+    from gz_onboard.arrays import Array
+
+METRES_PER_DEGREE = 111_200.0  # of latitude; 0.3 % off at most, over some hundred metres
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A place on the route: its distance along it [m], how far it is [m], and the route's heading there [rad]."""
+@dataclass(frozen=True)
+class PositionConfig:
+    """Constants of following a route and comparing its heights; m unless stated."""
 
-    along: float
-    off: float
-    heading: float
+    off: float = 50.0  # from the route: a receiver in a town and a map are off by 20 m together
+    leaving: float = 60.0  # ridden off the route before that is believed: receivers err for seconds
+    joining: float = 30.0  # from the route, to be taken as on it again
+    staying: float = 40.0  # ridden on it before that is believed
+    staying_far: float = 300.0  # the same, where it would be a leap along the route
+    leap: float = 500.0  # along the route, beside what was ridden off it
+    around: float = 130.0  # to both sides of where it should be: 80, and 5 % of a tunnel of 1 km
+    longitudinal: float = 5.0  # a metre along the route counts so much less than one beside it
+    gain: float = 0.3  # share of the difference along the route that one fix corrects
+    against: float = 2.0  # rad between the course and the route's heading: ridden the other way
+    compared: float = 1500.0  # over which heights are compared: a receiver's altitude drifts by some metres on it
+    min_compared: float = 700.0  # of that, before which nothing is said
+    heights_apart: float = 0.02  # of the way: differing by more they are of two roads
+    heights_alike: float = 0.01  # by less of one again
+    step: float = 100.0  # longer ones, or farther from the distance ridden: along the route it was placed elsewhere
+
+
+CONFIG = PositionConfig()
 
 
 class RoutePosition:
-    """Follows the vehicle along `route`. `along`: how far along it is [m]; `on`: whether it is on the route."""
+    """Follows the vehicle along a route. `along`: how far along it is [m], while it is `on` it."""
 
     def __init__(self, route: Route) -> None:
-        self._route = route
-        self.along, self.on = 0.0, True
+        """Import numpy."""
+        import numpy as np
+
+        self._np, self.along, self.on = np, 0.0, True
         self._placed = False  # a fix has been seen
-        self._blind = 0.0  # m ridden since the last fix on the route
         self._away = 0.0  # m ridden off the route, or against it
-        self._back: tuple[float, float] | None = None  # where it may be on the route again, and for how many m
-        self._cells: dict[tuple[int, int], list[int]] = defaultdict(list)
-        if route.latitude:
-            self._scale = DEGREE * cos(radians(route.latitude[0])), DEGREE
-            self._index()
+        self._candidate: float | None = None  # m: where it may be on the route again
+        self._stayed = 0.0  # m ridden there
+        self._distance = np.array(route.distance)
+        self._latitude = np.array(route.latitude)
+        self._longitude = np.unwrap(np.array(route.longitude), period=360.0)
 
-    def _index(self) -> None:
-        points = list(zip(self._route.longitude, self._route.latitude, strict=True))
-        for i, ((x0, y0), (x1, y1)) in enumerate(pairwise(points)):
-            steps = 1 + int(hypot(_turned(x1 - x0) * self._scale[0], (y1 - y0) * self._scale[1]) / CELL)
-            for k in range(steps + 1):
-                cell = self._cell(x0 + _turned(x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps)
-                if not self._cells[cell] or self._cells[cell][-1] != i:
-                    self._cells[cell].append(i)
-
-    def _cell(self, longitude: float, latitude: float) -> tuple[int, int]:
-        return int(longitude % 360 * self._scale[0] // CELL), int(latitude * self._scale[1] // CELL)
-
-    def at(self, along: float) -> tuple[float, float] | None:
-        """Latitude and longitude [deg] so far along the route [m]; None if the route has no positions."""
-        route = self._route
-        if not route.latitude:
-            return None
-        i = min(max(bisect_right(route.distance, along), 1), len(route.distance) - 1)
-        share = (along - route.distance[i - 1]) / (route.distance[i] - route.distance[i - 1])
-        y, x = route.latitude[i - 1], route.longitude[i - 1]
-        turned = _turned(x + share * _turned(route.longitude[i] - x))
-        return y + share * (route.latitude[i] - y), turned
+    def at(self, along: float) -> tuple[float | None, float | None]:
+        """Latitude and longitude [deg] at a distance along the route [m]; None if the route has no positions."""
+        if not len(self._latitude):
+            return None, None
+        interp = self._np.interp
+        longitude = float(interp(along, self._distance, self._longitude))
+        return float(interp(along, self._distance, self._latitude)), (longitude + 180.0) % 360.0 - 180.0
 
     def update(self, moved: float, fix: tuple[float, float] | None, course: float | None) -> None:
-        """Go on by `moved` [m]; fix: latitude and longitude [deg], if known; course [rad], if it is moving."""
-        if fix is None or not self._cells:
-            self._count(moved)
+        """Move by `moved` [m]; fix: latitude and longitude [deg], if known; course [rad], if it is moving."""
+        self.along += moved
+        if fix is None or not len(self._latitude):
+            self._away += 0.0 if self.on else moved
         elif self.on and self._placed:
             self._follow(moved, fix, course)
         else:
-            self._find(moved, fix, course)
-        if self.along >= self._route.length:
-            self.along, self.on = self._route.length, False
-
-    def _count(self, moved: float) -> None:
-        if self.on:
-            self.along += moved
-            self._blind += moved
-        else:
-            self._away += moved
+            self._search(moved, fix, course)
+        if self.on and self.along >= self._distance[-1]:
+            self.along, self.on = float(self._distance[-1]), False
 
     def _follow(self, moved: float, fix: tuple[float, float], course: float | None) -> None:
-        self.along += moved
-        self._blind += moved
-        around = AROUND + PER_METRE * self._blind
-        distance = self._route.distance
-        low = max(bisect_right(distance, self.along - around) - 1, 0)
-        high = min(bisect_right(distance, self.along + around), len(distance) - 1)
-        places = [self._nearest(i, fix) for i in range(low, high)]
-        best = min(
-            places, key=lambda p: p.off**2 + ((p.along - self.along) / LONGITUDINAL) ** 2, default=Place(0, FAR, 0)
-        )
-        against = course is not None and abs(_turn(course - best.heading)) > AGAINST
-        if best.off < FAR:
-            self.along += GAIN * (best.along - self.along)
-            self._blind = 0.0
-        if best.off < FAR and not against:
-            self._away = 0.0
+        config = CONFIG
+        along, off, turned = self._places(fix, course, config.around)
+        on = False
+        if len(along):
+            best = (off**2 + ((along - self.along) / config.longitudinal) ** 2).argmin()
+            if off[best] < config.off:
+                self.along += config.gain * float(along[best] - self.along)
+                on = bool(turned[best] < config.against)
+        self._away = 0.0 if on else self._away + moved
+        if self._away > config.leaving:
+            self.on, self._candidate = False, None
+
+    def _search(self, moved: float, fix: tuple[float, float], course: float | None) -> None:
+        """Look for the vehicle on all of the route."""
+        config, first = CONFIG, not self._placed
+        self._away, self._placed, self.on = self._away + moved, True, False
+        along, off, turned = self._places(fix, course, inf)
+        along = along[(off < config.joining) & (turned < pi / 2)]
+        if not len(along):
+            self._candidate = None
             return
-        self._away += moved
-        if self._away > LEAVING:
-            self.on, self._back = False, None
+        expected = self.along if self._candidate is None else self._candidate + moved
+        place = float(along[abs(along - expected).argmin()])
+        stays = self._candidate is not None and abs(place - expected) <= config.around
+        self._candidate, self._stayed = place, self._stayed + moved if stays else 0.0
+        far = abs(place - self.along)
+        if (first and far < config.around) or self._stayed >= (
+            config.staying_far if far > config.leap + self._away else config.staying
+        ):
+            self.along, self.on, self._away = place, True, 0.0
 
-    def _find(self, moved: float, fix: tuple[float, float], course: float | None) -> None:
-        """Search all of the route for where `fix` is."""
-        self._away += moved
-        left = self.along + self._away
-        expected, stayed = (self._back[0] + moved, self._back[1] + moved) if self._back else (left, 0.0)
-        x, y = self._cell(fix[1], fix[0])
-        near = {i for dx in (-1, 0, 1) for dy in (-1, 0, 1) for i in self._cells.get((x + dx, y + dy), ())}
-        places = [place for i in near if (place := self._nearest(i, fix)).off < JOINING]
-        if course is not None:
-            places = [place for place in places if abs(_turn(course - place.heading)) < pi / 2]
-        first, self._placed, self.on = not self._placed, True, False
-        if not places:
-            self._back = None
+    def _places(self, fix: tuple[float, float], course: float | None, around: float) -> tuple[Array, Array, Array]:
+        """Of each piece of the route within `around` [m]: the place nearest to `fix`.
+
+        Gives its distance along the route [m], how far it is from the fix [m], and the angle [rad] between the course
+        and the route there, 0 without a course.
+        """
+        np = self._np
+        low, high = np.searchsorted(self._distance, (self.along - around, self.along + around))
+        some = slice(max(int(low) - 1, 0), int(high) + 1)
+        x = (self._longitude[some] - fix[1] + 180.0) % 360.0 - 180.0
+        x, y = x * METRES_PER_DEGREE * cos(radians(fix[0])), (self._latitude[some] - fix[0]) * METRES_PER_DEGREE
+        dx, dy, length = np.diff(x), np.diff(y), np.diff(self._distance[some])
+        share = np.clip(-(x[:-1] * dx + y[:-1] * dy) / (dx**2 + dy**2), 0.0, 1.0)
+        off = np.hypot(x[:-1] + share * dx, y[:-1] + share * dy)
+        turned = 0.0 * off if course is None else np.abs((course - np.arctan2(dx, dy) + pi) % (2 * pi) - pi)
+        return self._distance[some][:-1] + share * length, off, turned
+
+
+class HeightCheck:
+    """Whether the hills of a route are those ridden: a file of another road, or in feet, has others.
+
+    Compares the height that the route gains with that which the vehicle gains on it, over the latest kilometre or so.
+    """
+
+    def __init__(self) -> None:
+        self.contradicts = False
+        self._before: tuple[float, float] | None = None  # m along the route, m of altitude
+        self._way = self._apart = 0.0  # m, fading
+
+    def update(self, along: float, ridden: float, climb: float, altitude: float | None) -> None:
+        """The vehicle is at `along` [m] of the route, `ridden` [m] since the last update.
+
+        climb: that the route gains between the two [m]; altitude: measured [m], None if it is not known.
+        """
+        config, before = CONFIG, self._before
+        self._before = None if altitude is None else (along, altitude)
+        if before is None or altitude is None:
             return
-        place = min(places, key=lambda p: abs(p.along - expected))
-        if abs(place.along - expected) > AROUND:
-            stayed = 0.0
-        self._back = place.along, stayed
-        leap = abs(place.along - left) > LEAP + self._away
-        if stayed >= (STAYING_AFAR if leap else STAYING) or (first and abs(place.along - left) < AROUND):
-            self.along, self.on, self._away, self._blind, self._back = place.along, True, 0.0, 0.0, None
-
-    def _nearest(self, i: int, fix: tuple[float, float]) -> Place:
-        """The place nearest to `fix` between the points `i` and `i` + 1."""
-        route = self._route
-        wide = DEGREE * cos(radians(fix[0]))
-        x0, x1 = (_turned(route.longitude[j] - fix[1]) * wide for j in (i, i + 1))
-        y0, y1 = ((route.latitude[j] - fix[0]) * DEGREE for j in (i, i + 1))
-        dx, dy = x1 - x0, y1 - y0
-        share = min(max(-(x0 * dx + y0 * dy) / (dx * dx + dy * dy), 0.0), 1.0)
-        along = route.distance[i] + share * (route.distance[i + 1] - route.distance[i])
-        return Place(along, hypot(x0 + share * dx, y0 + share * dy), atan2(dx, dy))
-
-
-def _turned(degrees: float) -> float:
-    """A difference of longitudes, the short way round."""
-    return (degrees + 180.0) % 360.0 - 180.0
-
-
-def _turn(angle: float) -> float:
-    """A difference of directions, the short way round [rad]."""
-    return (angle + pi) % (2 * pi) - pi
+        way, gained = along - before[0], altitude - before[1]
+        if not 0 < way < config.step or abs(way - ridden) > config.step or abs(gained) > way:
+            return
+        kept = exp(-way / config.compared)
+        self._way, self._apart = kept * self._way + way, kept * self._apart + climb - gained
+        if self._way > config.min_compared:
+            limit = config.heights_alike if self.contradicts else config.heights_apart
+            self.contradicts = abs(self._apart) > limit * self._way

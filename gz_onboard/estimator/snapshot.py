@@ -8,7 +8,7 @@ from typing import Any
 from gz_onboard.errors import shown
 from gz_onboard.estimator import ageing, forecast, start, weakest
 from gz_onboard.estimator.cell_effects import LARGEST
-from gz_onboard.estimator.road import MOST_BIAS
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.saved_fields import Each, Number, check
 
 VERSION = 4
@@ -18,7 +18,7 @@ FIELDS: Mapping[str, Any] = {
     **start.FIELDS,
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
     "cell_temperature": Number(-50.0, 120.0, optional=True),  # degC
-    "gyro_bias": Each(Number(-MOST_BIAS, MOST_BIAS), 2),  # rad/s, of roll and yaw rate
+    "gyro_bias": Each(Number(-MOTION.max_gyro_bias, MOTION.max_gyro_bias), 2),  # rad/s, of roll and yaw rate
     "riding": forecast.FIELDS,
     "learned": {**ageing.FIELDS, "weakest": weakest.FIELDS},
 }

@@ -1,345 +1,311 @@
-"""The weakest group of cells: by how much it differs from the mean cell, out of the lowest cell's voltage.
+"""The weakest group of cells: how it differs from the mean cell, out of the lowest cell's voltage.
 
-The mean cell is that of the filter; small slow filters follow the difference to it (bar-delta filtering: Plett 2009,
-EVS24). Both carry the same current, so that what the cell model errs by cancels in the difference of their voltages,
+The mean cell is that of the battery filter; this slow filter follows the difference to it (bar-delta filtering: Plett
+2009, EVS24). Both carry the same current, so that errors of the cell model cancel in their difference,
 
-    V_low - V_mean = U(z - Δ) - U(z) - ρ·drop + b,      Δ = charge + faster·(1 - z)
+    V_low - V_mean = U(z - Δ) - U(z) - ρ·drop + b,      Δ = charge + capacity·(1 - z)
 
-with z the mean cell's state of charge, U the open-circuit voltage, and `drop` what the load takes from the mean cell's
-voltage. `charge` is a difference in charge when full, `faster` one in capacity, ρ one in resistance, and b what the two
-sensors differ by. As the difference follows from z alone, nothing is to be predicted between two measurements: each
-block of some charge gives one. Within a block the difference moves with the load by ρ, pooled over blocks by least
-squares; what there is without load goes into a filter of (charge, faster, b).
+with z the mean cell's state of charge, U the open-circuit voltage, and `drop` the mean cell's voltage drop under
+load. The state is `charge`, a difference in charge when full, `capacity`, one in capacity, ρ, one in resistance, and
+b, the difference of the two sensors. It does not change between measurements: each block of some charge gives one of ρ,
+out of how the difference moves with the load within the block, and one of all four, out of its mean.
 
-The curve's slope errs by `SLOPE_SD` at its place, however many blocks lie there. Without charge that flows no block
-ends. The lowest voltage is that of whichever group has it: the difference is that of the lower edge of them all. A
-small difference is mostly the spread of healthy groups: of it little is used.
-
-A signal that no group can have is refused, and what was learned from it: above the mean, further below than
-`MOST_BEHIND`, held while the pack's voltage moves, jumping; or the pack goes on when the group would long be empty. A
-block that only contradicts what is known is left out, and makes what is known less certain, for packs are balanced and
-mended.
+A block that no group can have had is left out: above the mean, too far below, jumping, or not moving with the load. So
+is one that contradicts the belief, which then becomes less certain, for packs are balanced and mended. After many such
+blocks, or where the pack still delivers though the group would long be empty, the signal is refused until it makes
+sense again. The lowest voltage is that of whichever group has it, so a small difference is mostly the spread of healthy
+groups: little of it is used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import hypot, inf, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ageing import SAME, Learned
-from gz_onboard.estimator.joint import Joint
-from gz_onboard.estimator.saved_fields import FINITE, Each
+from gz_onboard.estimator.saved_fields import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.parameters import Parameters
 
-CHARGE, CAPACITY, RESISTANCE = (-0.05, 0.25), (-0.1, 0.6), (-0.4, 3.0)  # differences that a pack at work has
-CHARGE_SD, CAPACITY_SD, RESISTANCE_SD = 0.03, 0.08, 0.4  # of packs of which nothing is known
-EDGE_SD = 0.004  # V: by how much channels of one monitor differ, and the lowest of many that are noisy from their mean
-LEAST_SD = 0.002  # V: of what a block says
-SLOPE_SD = 0.12  # relative: of the curve's slope at its place
-PLACE, PLACE_SD = 0.03, 0.005  # of SOC: over which the curve errs the same way; of the mean cell's place on it
-BLOCK, FEWEST = 0.0025, 5  # of SOC that flows in a block, at least; samples in one
-STEADY, HOLDS = 0.008, 0.9  # V of a cell, s: a voltage that moves by less for so long; monitors are slow, and late
-KNOWN_SD = 0.04  # of SOC: sd from which the mean cell's place on the curve is known
-LOAD_WEIGHT = 0.002  # V²: what no difference in resistance counts beside the load that is seen
-LOAD_MEMORY = 300.0  # blocks
-LOAD_SD = 0.04  # of ρ: resistance in the pack beside the cells, and what one RC pair leaves
-MOST_BEHIND = 0.25  # of SOC
-ABOVE = 0.015  # V: the lowest is not above the mean by more
-JUMPS, FALLS = 0.012, 0.1  # V: sd within a block beyond what the load explains; of the difference: where it falls fast
-HELD = 0.03  # V: by so much the mean moves while the lowest holds one value
-PAST = 0.02  # of SOC, beside two sd: a group that is believed to be emptier, while charge flows, is no group
-GATE = 5.0  # sd: a block that is further off is left out
-MISFIT_SD = 0.0007  # of SOC: what such a block adds to what is not known
-TELLING = 0.35  # of SOC: nearer to empty a low voltage is possible, whatever it is
-DOUBT, DOUBTED, TRUSTED = 0.15, 0.5, 0.02  # share of the next block; of refused blocks: from which, until which
-PROVEN = 12  # blocks before anything is used
-KEPT = 40  # blocks above `TELLING` without a doubt: then what is learned is kept
-SEEN = 2.0  # sd
-SPREAD, SPREAD_RESISTANCE = 0.008, 0.06  # sd of healthy packs' weakest group: of SOC at the end; relative
-DRIFT = 0.01 / 20  # of SOC: sd that the difference in charge gains over sqrt(blocks), by leaks and balancing
-ROUNDED, MOST_OFFSET = 1.001, 20.0  # of a saved state: of a variance; sd
 NAMES = "weak_charge", "weak_capacity", "weak_resistance"
 
 
-@dataclass(slots=True)
-class Block:
-    """Sums over the samples of a block: difference d and drop u [V], SOC of the mean cell."""
+@dataclass(frozen=True)
+class WeakestConfig:
+    """Constants of the weakest group; differences of SOC or relative, of four: charge, capacity, resistance, offset."""
 
-    began: float = inf  # SOC
+    prior_sd: tuple[float, float, float] = (0.03, 0.08, 0.4)  # of packs of which nothing is known; no offset
+    lowest: tuple[float, float, float, float] = (-0.05, -0.1, -0.4, -0.2)  # that a pack at work has
+    highest: tuple[float, float, float, float] = (0.25, 0.6, 3.0, 0.2)
+    channel_sd: float = 0.004  # V: by which channels of one monitor differ
+    block: float = 0.0025  # of SOC, that flows in a block at least
+    min_samples: int = 5  # in a block
+    steady: float = 0.008  # V of a cell: a mean voltage that has moved by less for `steady_s`; monitors are slow
+    steady_s: float = 0.9
+    max_soc_sd: float = 0.04  # from which the mean cell's place on the curve is known
+    level_sd: float = 0.002  # V: of the mean of a block
+    slope_sd: float = 0.12  # relative: of the curve's slope at its place
+    place: float = 0.03  # of SOC: over which the curve errs the same way
+    place_sd: float = 0.005  # of SOC: of the mean cell's place on it
+    sample_sd: float = 0.018  # V: of a sample against the load that is seen
+    resistance_sd: float = 0.04  # of ρ: resistance in the pack beside the cells, and what one RC pair leaves
+    above: float = 0.015  # V: the lowest is not above the mean by more
+    jump: float = 0.012  # V: sd within a block beyond what the load explains
+    jump_relative: float = 0.1  # of the difference: where it falls fast
+    gate: float = 5.0  # sd: a block that is further off is left out
+    misfit_sd: float = 0.0007  # of SOC: what such a block adds to what is not known
+    walk_sd: float = 0.0005  # of SOC: change of the charge over a block, by leaks, balancing and errors of the curve
+    past_empty: float = 0.02  # of SOC, beside two sd: a group believed to be emptier while charge flows is no group
+    doubt_gain: float = 0.15  # share of the next block in the doubt
+    refused_from: float = 0.5  # doubt
+    trusted_below: float = 0.02  # doubt
+    proven: int = 12  # blocks, before anything is used
+    spread: float = 0.008  # of SOC at the end: sd of healthy packs' weakest group
+    spread_resistance: float = 0.06  # relative, likewise
+    seen_sd: float = 2.0  # of which half is used
+
+
+CONFIG = WeakestConfig()
+CHARGE, CAPACITY, RESISTANCE, OFFSET = range(4)
+
+
+@dataclass(slots=True)
+class VoltageBlock:
+    """Sums over the samples of a block: difference d to the mean cell and drop u [V]."""
+
+    began: float = inf  # SOC of the mean cell
     count: int = 0
     d: float = 0.0
     u: float = 0.0
     dd: float = 0.0
     du: float = 0.0
     uu: float = 0.0
-    soc: float = 0.0
-    lowest: tuple[float, float] = (inf, -inf)  # V: least and most of the signal
-    mean: tuple[float, float] = (inf, -inf)  # V: likewise of the mean cell
 
-    def add(self, lowest: float, mean: float, drop: float, soc: float) -> None:
-        """Take in a sample."""
+    def add(self, lowest: float, mean: float, drop: float) -> None:
+        """Take in a sample of voltages [V]."""
         d = lowest - mean
         self.count += 1
-        self.d, self.u, self.soc = self.d + d, self.u + drop, self.soc + soc
+        self.d, self.u = self.d + d, self.u + drop
         self.dd, self.du, self.uu = self.dd + d * d, self.du + d * drop, self.uu + drop * drop
-        self.lowest = min(self.lowest[0], lowest), max(self.lowest[1], lowest)
-        self.mean = min(self.mean[0], mean), max(self.mean[1], mean)
 
     @property
     def scatter(self) -> tuple[float, float, float]:
-        """Sums of the squares about the means [V²]: dd, du, uu."""
+        """Sums of the products of deviations from the means [V²]: dd, du, uu."""
         n = self.count
         return self.dd - self.d * self.d / n, self.du - self.d * self.u / n, self.uu - self.u * self.u / n
 
 
-@dataclass(slots=True)
-class Differences:
-    """What is known: charge, capacity and offset; of the resistance, sums over the load [V²]; from how many blocks."""
+@dataclass(frozen=True, slots=True)
+class GroupBelief:
+    """Means and covariance of charge, capacity, resistance and offset, out of so many blocks."""
 
-    joint: Joint
-    load: float = 0.0
-    response: float = 0.0
+    means: tuple[float, ...]
+    rows: tuple[tuple[float, ...], ...]
     blocks: int = 0
 
-    def copy(self) -> Differences:
-        """Another of its own."""
-        return Differences(self.joint.copy(), self.load, self.response, self.blocks)
+    @classmethod
+    def unknown(cls, sds: Sequence[float]) -> GroupBelief:
+        """Of a pack of which nothing is known but these standard deviations."""
+        rows = (tuple(sd * sd if i == j else 0.0 for j in range(len(sds))) for i, sd in enumerate(sds))
+        return cls((0.0,) * len(sds), tuple(rows))
 
-    @property
-    def resistance(self) -> float:
-        """ρ, as seen."""
-        return min(max(-self.response / (self.load + LOAD_WEIGHT), RESISTANCE[0]), RESISTANCE[1])
+    def variance(self, slopes: Sequence[float]) -> float:
+        """Variance of the state's sum with these `slopes`."""
+        return sum(
+            p * g * h for row, g in zip(self.rows, slopes, strict=True) for p, h in zip(row, slopes, strict=True)
+        )
 
-    @property
-    def resistance_sd(self) -> float:
-        """Of ρ."""
-        return hypot(RESISTANCE_SD * LOAD_WEIGHT / (self.load + LOAD_WEIGHT), LOAD_SD if self.load else 0.0)
+    def conditioned(self, slopes: Sequence[float], residual: float, noise: float) -> GroupBelief:
+        """After a measurement: a Kalman update. slopes: of it over the state; noise: its variance."""
+        gains = [sum(p * h for p, h in zip(row, slopes, strict=True)) for row in self.rows]
+        total = noise + self.variance(slopes)
+        means = (mean + gain / total * residual for mean, gain in zip(self.means, gains, strict=True))
+        rows = (
+            tuple(p - gain / total * g for p, g in zip(row, gains, strict=True))
+            for row, gain in zip(self.rows, gains, strict=True)
+        )
+        return GroupBelief(tuple(means), tuple(rows), self.blocks + 1)
+
+    def with_wider_charge(self, sd: float) -> GroupBelief:
+        """Less certain of the charge by a change of `sd`, but never less than before the first block."""
+        (own, *others), *rows = self.rows
+        wider = max(min(own + sd**2, CONFIG.prior_sd[CHARGE] ** 2), own)
+        return replace(self, rows=((wider, *others), *rows))
+
+    def within_limits(self) -> GroupBelief:
+        """With each mean as a pack at work can have it."""
+        return replace(self, means=tuple(map(max, CONFIG.lowest, map(min, CONFIG.highest, self.means))))
+
+    def behind(self, gone: float) -> tuple[float, float]:
+        """SOC by which the group is behind when `gone` of the mean cell's is drawn, and its standard deviation."""
+        variance = self.variance((1.0, gone, 0.0, 0.0))
+        return self.means[CHARGE] + self.means[CAPACITY] * gone, sqrt(max(variance, 0.0))
+
+    def sd(self, i: int) -> float:
+        """Standard deviation of one quantity."""
+        floor = CONFIG.resistance_sd if i == RESISTANCE and self.blocks else 0.0
+        return hypot(sqrt(self.rows[i][i]), floor)
 
 
-class Weakest:
+class WeakestGroup:
     """Learns the differences of one pack's weakest group, and gives them to its `Battery`."""
 
     def __init__(self, battery: Battery, signals: Signals, parameters: Parameters) -> None:
         self._battery, self._signals, self._signal = battery, signals, signals.lowest_cell_voltage
-        offset = hypot(parameters.sd("pack_voltage_offset") / battery.cells_series, EDGE_SD)
-        self._unknown = (CHARGE_SD**2, CAPACITY_SD**2, offset**2)
-        self._above = ABOVE + 2 * offset
-        self.known = self._new()
-        self._kept, self._sound = self._new(), 0  # what to go back to; blocks without a doubt since
-        self._block = Block()
-        self._held, self._since = inf, inf  # V about which the mean cell's voltage has held, s: since when
-        self._then = -inf  # s: when the pack's voltage came last
-        self._doubt = 0.0
-        self.refused = False
+        offset_sd = hypot(parameters.sd("pack_voltage_offset") / battery.cells_series, CONFIG.channel_sd)
+        self._prior_sd = (*CONFIG.prior_sd, offset_sd)
+        self._above = CONFIG.above + 2 * offset_sd
+        self._seen_at = self._steady_since = -inf  # s
+        self._steady_at = inf  # V about which the mean cell's voltage has held since
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Nothing is known of the pack."""
+        self.known = self._undoubted = GroupBelief.unknown(self._prior_sd)
+        self._block, self._doubt, self.refused = VoltageBlock(), 0.0, False
 
     @property
     def mapped(self) -> bool:
         """Whether the vehicle has the signal."""
         return bool(self._signal.stale_after)
 
-    def _new(self) -> Differences:
-        return Differences(Joint((0.0, 0.0, 0.0), self._unknown))
-
-    # --- what others ask --------------------------------------------------------------------------------------
-
     def learned(self) -> dict[str, Learned]:
-        """Of the weakest group over the mean cell: charge when that is full, capacity, resistance; by `NAMES`."""
-        known = self.known
-        charge, faster, _ = known.joint.means
-        sds = [sqrt(known.joint.variance(i)) for i in range(2)]
-        shares = [max(1 - sd / sqrt(unknown), 0.0) for sd, unknown in zip(sds, self._unknown, strict=False)]
-        rest = known.resistance_sd
-        holds = 1 / (1 + faster)
-        found = (
-            Learned(1 - charge, sds[0], shares[0]),
-            Learned(holds, sds[1] * holds * holds, shares[1]),
-            Learned(1 + known.resistance, rest, max(1 - rest / RESISTANCE_SD, 0.0)),
-        )
-        return dict(zip(NAMES, found, strict=True))
+        """Charge when full, capacity and resistance of the weakest group over the mean cell's; by `NAMES`."""
+        known, holds = self.known, 1 / (1 + self.known.means[CAPACITY])
+        factors = 1 - known.means[CHARGE], holds, 1 + known.means[RESISTANCE]
+        sds = known.sd(CHARGE), known.sd(CAPACITY) * holds * holds, known.sd(RESISTANCE)
+        shares = (max(1 - known.sd(i) / sd, 0.0) for i, sd in enumerate(CONFIG.prior_sd))
+        return {name: Learned(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
 
     def believed(self) -> WeakGroup | None:
-        """What is used: of a difference that is small beside its sd and healthy groups' spread next to nothing."""
+        """The group as used; a difference that is small against its sd and healthy groups' spread counts little."""
         known = self.known
-        if known.blocks < PROVEN:
+        if known.blocks < CONFIG.proven:
             return None
-        charge, faster, _ = known.joint.means
-        (v00, _, _), (v10, v11, _), _ = known.joint.rows
-        behind, variance = max(charge + faster, 0.0), v00 + 2 * v10 + v11  # at the end
-        seen = (charge, v00), (behind, variance)  # that there is one may be clear from full on, or only at the end
-        share = max(trusted(max(x, 0.0), own + SPREAD**2) for x, own in seen)
-        more = max(known.resistance, 0.0)
-        more *= trusted(more, known.resistance_sd**2 + SPREAD_RESISTANCE**2)
-        return WeakGroup(share * charge, share * faster, more, sd=hypot(share * sqrt(variance), (1 - share) * behind))
+        full, end = known.behind(0.0), known.behind(1.0)  # it may be clear from full on, or only at the end
+        share = max(_trusted(max(behind, 0.0), hypot(sd, CONFIG.spread)) for behind, sd in (full, end))
+        more = max(known.means[RESISTANCE], 0.0)
+        more *= _trusted(more, hypot(known.sd(RESISTANCE), CONFIG.spread_resistance))
+        sd = hypot(share * end[1], (1 - share) * max(end[0], 0.0))
+        return WeakGroup(share * known.means[CHARGE], share * known.means[CAPACITY], more, sd)
 
     # --- learning ---------------------------------------------------------------------------------------------
 
     def step(self, now: float, reading: PackReading, temperature: float, soc: StateOfCharge) -> None:
-        """Take in what came since the last step, at `now` [s]; temperature: of the cells [degC]."""
-        signal = self._signal
+        """Take in the window that ends at `now` [s]; temperature: of the cells [degC]."""
         if soc.another_pack:
             self._begin_anew()
-        if not self.mapped or not self._signals.pack_voltage.count:
+            self._battery.weaken(None)
+        if not self.mapped or reading.voltage is None or reading.current is None or soc.filter is None:
             return
-        new, self._then = signal.time > self._then, now  # between two of the pack's voltages
-        if reading.voltage is None or reading.current is None or soc.filter is None:
-            self._held = inf
-            return
-        battery = self._battery
+        battery, signals = self._battery, self._signals
+        is_new, self._seen_at = self._signal.time > self._seen_at, self._signal.time
         mean = battery.cell_voltage(reading.voltage, reading.current)
-        if abs(mean - self._held) > STEADY:
-            self._held, self._since = mean, now
-        if not new or now - self._since < HOLDS or not self._permitted(now, reading):
+        if abs(mean - self._steady_at) > CONFIG.steady:
+            self._steady_at, self._steady_since = mean, now
+        sound = reading.source is CurrentSource.PACK and not reading.voltage_doubted
+        sound = sound and signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
+        if not is_new or not sound or now - self._steady_since < CONFIG.steady_s:
             return
         place, sd = soc.ageing.state_of_charge(soc.filter)
         current = reading.current / battery.cells_parallel
-        if sd > KNOWN_SD or current < 0:  # of a charge the lowest is another group
+        if sd > CONFIG.max_soc_sd or current < 0:  # while charging the lowest is another group
             return
-        if not -BLOCK < self._block.began - place < PLACE:  # the first, after a charge, or of another state of charge
-            self._block = Block(place)
+        if not -CONFIG.block < self._block.began - place < CONFIG.place:  # the first, after a charge, or a new SOC
+            self._block = VoltageBlock(place)
         drop = battery.r0.at(place, temperature)[0] * current + soc.effects.overpotential + soc.filter.v1
-        self._block.add(signal.value, mean, drop, place)
-        block = self._block
-        if block.began - place >= BLOCK and block.count >= FEWEST:
-            self._block = Block(place)
-            self.take(block)
+        self._block.add(self._signal.value, mean, drop)
+        if self._block.began - place >= CONFIG.block and self._block.count >= CONFIG.min_samples:
+            block, self._block = self._block, VoltageBlock(place)
+            self.take(block, (block.began + place) / 2)
 
-    def _begin_anew(self) -> None:
-        """Nothing is known: the pack is another one."""
-        self.known, self._kept, self._block = self._new(), self._new(), Block()
-        self._sound, self._doubt, self.refused = 0, 0.0, False
-        self._battery.weaken(None)
-
-    def _permitted(self, now: float, reading: PackReading) -> bool:
-        """Whether all else that the learning depends on is beyond doubt."""
-        sound = reading.source is CurrentSource.PACK and not reading.voltage_doubted
-        signals = self._signals
-        return sound and signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
-
-    def take(self, block: Block) -> None:
-        """Learn from a whole block, if it can be true."""
-        possible, telling = self._possible(block), block.began > TELLING
-        if telling or not possible:
-            self._doubt += DOUBT * ((not possible) - self._doubt)
-        if self._doubt > DOUBTED and not self.refused:
-            self.refused = True
-            self.known, self._sound = self._kept.copy(), 0
-        self.refused = self.refused and self._doubt > TRUSTED
-        if self._past_its_end(block):
-            self.refused, self._doubt, self._sound = True, 1.0, 0
-            self.known, self._kept = self._new(), self._new()
-        if possible and not self.refused:
-            self._learn(block)
-            self._sound += telling
-        if self._sound >= KEPT and self._doubt < TRUSTED:
-            self._kept, self._sound = self.known.copy(), 0
+    def take(self, block: VoltageBlock, soc: float) -> None:
+        """Learn from a whole block about this `soc` of the mean cell, if it can be true."""
+        learned = self._learned_from(block, soc)
+        self._doubt += CONFIG.doubt_gain * ((learned is None) - self._doubt)
+        if self._doubt > CONFIG.refused_from and not self.refused:
+            self.refused, self.known = True, self._undoubted
+        self.refused = self.refused and self._doubt > CONFIG.trusted_below
+        if learned and not self.refused:
+            self.known = learned
+        behind, sd = self.known.behind(1 - soc)
+        if self.known.blocks >= CONFIG.proven and soc - behind + 2 * sd < -CONFIG.past_empty:
+            self._begin_anew()
+            self.refused, self._doubt = True, 1.0
+        if self._doubt < CONFIG.trusted_below:
+            self._undoubted = self.known
         self._battery.weaken(self.believed())
 
-    def _past_its_end(self, block: Block) -> bool:
-        """Whether the pack goes on where its weakest group would long be empty by what is known of it."""
-        gone = 1 - block.soc / block.count
-        charge, faster, _ = self.known.joint.means
-        (v00, _, _), (v10, v11, _), _ = self.known.joint.rows
-        sd = sqrt(max(v00 + gone * (2 * v10 + gone * v11), 0.0))
-        return self.known.blocks >= PROVEN and 1 - gone - charge - faster * gone + 2 * sd < -PAST
-
-    def _possible(self, block: Block) -> bool:
-        """Whether any group can have had such voltages."""
-        dd, du, uu = block.scatter
-        left = max(dd - du * du / uu, 0.0) if uu > 0 else dd
-        held = block.lowest[0] == block.lowest[1] and block.mean[1] - block.mean[0] > HELD
-        jumps = JUMPS + FALLS * abs(block.d) / block.count
-        if held or left > jumps**2 * block.count:
-            return False
-        slope = (self.known.response + du) / (self.known.load + uu + LOAD_WEIGHT)
-        if not RESISTANCE[0] < -slope < RESISTANCE[1]:
-            return False
-        soc, alone = block.soc / block.count, (block.d - slope * block.u) / block.count
-        lowest = self._behind(soc, MOST_BEHIND) - self._above
-        return lowest < alone < self._above
+    def _learned_from(self, block: VoltageBlock, soc: float) -> GroupBelief | None:
+        """The belief after a block; None if no group can have had such voltages."""
+        config, n = CONFIG, block.count
+        (dd, du, uu), mean, drop = block.scatter, block.d / n, block.u / n
+        unexplained = max(dd - du * du / uu, 0.0) if uu > 0 else dd
+        noise = config.sample_sd**2 * max(uu, 1e-12)  # V⁴, of the block's response to the load
+        if unexplained > (config.jump + config.jump_relative * abs(mean)) ** 2 * n:
+            return None
+        known = self.known.conditioned((0.0, 0.0, uu, 0.0), -du - self.known.means[RESISTANCE] * uu, noise)
+        alone = mean + known.means[RESISTANCE] * drop  # what the difference would be without load
+        follows = config.lowest[RESISTANCE] < known.means[RESISTANCE] < config.highest[RESISTANCE]
+        if not follows or not self._behind(soc, config.highest[CHARGE]) - self._above < alone < self._above:
+            return None
+        behind, _ = known.behind(1 - soc)
+        predicted, slope = self._behind(soc, behind), self._battery.ocv(soc - behind)[1]
+        curve = hypot(config.slope_sd * predicted, config.place_sd * (slope - self._battery.ocv(soc)[1]))
+        noise = config.level_sd**2 + curve**2 + (config.resistance_sd * drop) ** 2
+        slopes = -slope, -slope * (1 - soc), -drop, 1.0
+        residual = alone - predicted - known.means[OFFSET]
+        if residual**2 > config.gate**2 * (noise + known.variance(slopes)):
+            return self.known.with_wider_charge(config.misfit_sd)
+        known = known.with_wider_charge(config.walk_sd)
+        learned = known.conditioned(slopes, residual, noise * config.place / config.block).within_limits()
+        return replace(learned, blocks=self.known.blocks + 1)
 
     def _behind(self, soc: float, by: float) -> float:
         """By how much the open-circuit voltage is higher [V] where it is `by` behind `soc`."""
         return self._battery.ocv(soc - by)[0] - self._battery.ocv(soc)[0]
 
-    def _learn(self, block: Block) -> None:
-        known, n = self.known, block.count
-        _, du, uu = block.scatter
-        fade = 1 - 1 / LOAD_MEMORY
-        known.load, known.response = fade * known.load + uu, fade * known.response + du
-        soc, drop = block.soc / n, block.u / n
-        joint = known.joint
-        charge, faster, offset = joint.means
-        behind = charge + faster * (1 - soc)
-        predicted = self._behind(soc, behind)
-        slope = self._battery.ocv(soc - behind)[1]
-        residual = (block.d + known.resistance * block.u) / n - predicted - offset
-        steeper = slope - self._battery.ocv(soc)[1]
-        curve = (SLOPE_SD * predicted) ** 2 + (PLACE_SD * steeper) ** 2
-        noise = LEAST_SD**2 + curve + (known.resistance_sd * drop) ** 2
-        noise *= PLACE / BLOCK
-        slopes = (-slope, -slope * (1 - soc), 1.0)
-        gains = [sum(p * h for p, h in zip(row, slopes, strict=True)) for row in joint.rows]
-        if residual**2 > GATE**2 * (noise * BLOCK / PLACE + sum(g * h for g, h in zip(gains, slopes, strict=True))):
-            joint.widen(0, MISFIT_SD**2, CHARGE_SD**2)
-            return
-        joint.widen(0, DRIFT**2, CHARGE_SD**2)
-        joint.update(slopes, residual, noise, GATE)
-        joint.means[0] = min(max(joint.means[0], CHARGE[0]), CHARGE[1])
-        joint.means[1] = min(max(joint.means[1], CAPACITY[0]), CAPACITY[1])
-        known.blocks += 1
-
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """What is to be kept over a restart; of: what the vehicle file says."""
-        return {"of": self._battery.capacity, "known": _numbers(self.known), "kept": _numbers(self._kept)}
+        """The belief, to be kept over a restart; of: the capacity in the vehicle file."""
+        known = self.known
+        return {"of": self._battery.capacity, "means": known.means, "rows": known.rows, "blocks": known.blocks}
 
-    def read(self, saved: Mapping[str, Any] | None) -> tuple[Differences, Differences]:
-        """What a snapshot holds: nothing learned if there is none, or if it is of another pack.
+    def read(self, saved: Mapping[str, Any] | None) -> GroupBelief:
+        """The belief in a snapshot: nothing learned if there is none, or if it is of another pack.
 
-        Gives what is known, and what to go back to. KeyError, TypeError or ValueError if it holds what cannot be.
+        KeyError, TypeError or ValueError if it holds what cannot be.
         """
+        unknown = GroupBelief.unknown(self._prior_sd)
         if saved is None or not abs(float(saved["of"]) / self._battery.capacity - 1) <= SAME:
-            return self._new(), self._new()
-        return self._read(saved["known"]), self._read(saved["kept"])
-
-    def _read(self, saved: Mapping[str, Any]) -> Differences:
-        joint = self._new().joint.restored(saved["means"], saved["rows"])
-        load, response, blocks = float(saved["load"]), float(saved["response"]), int(saved["blocks"])
-        if not (isfinite(load + response) and load >= 0 and blocks >= 0):
-            raise ValueError("holds an impossible weakest group")
-        charge, faster, offset = joint.means
-        known = all(0 < joint.variance(i) <= most * ROUNDED for i, most in enumerate(self._unknown))
-        plausible = CHARGE[0] <= charge <= CHARGE[1] and CAPACITY[0] <= faster <= CAPACITY[1]
-        if not (known and plausible and abs(offset) <= MOST_OFFSET * sqrt(self._unknown[2])):
+            return unknown
+        means = tuple(map(float, saved["means"]))
+        rows = tuple(tuple(map(float, row)) for row in saved["rows"])
+        found, most = GroupBelief(means, rows, int(saved["blocks"])), 1.001  # of rounding
+        fits = [len(means), *map(len, rows)] == [4] * 5 and all(map(isfinite, means)) and found.within_limits() == found
+        for i, row in enumerate(rows if fits else ()):
+            fits &= 0 < row[i] <= most * unknown.rows[i][i]
+            fits &= all(p * p <= most * row[i] * rows[j][j] for j, p in enumerate(row))
+        if not fits or found.blocks < 0:
             raise ValueError("holds an implausible weakest group")
-        return Differences(joint, load, response, blocks)
+        return found
 
-    def take_on(self, saved: tuple[Differences, Differences]) -> None:
-        """Go on from what `read` gave."""
-        self.known, kept = saved
-        # Once something was learned where a lie shows, one that begins elsewhere contradicts it and is left out.
-        self._kept = self.known.copy() if kept.blocks >= PROVEN else kept
+    def take_on(self, saved: GroupBelief) -> None:
+        """Continue from the belief that `read` gave."""
+        self.known = self._undoubted = saved
         self._battery.weaken(self.believed())
 
 
-_COUNTS = dict.fromkeys(("load", "response", "blocks"), FINITE)
-_DIFFERENCES = {"means": Each(FINITE, 3), "rows": Each(FINITE, 6), **_COUNTS}
-FIELDS = {"of": FINITE, "known": _DIFFERENCES, "kept": _DIFFERENCES}
-"""Of the saved state; `Weakest.read` knows their bounds."""
+FIELDS = {"of": FINITE, "means": Each(FINITE, 4), "rows": Each(Each(FINITE, 4), 4), "blocks": Number(0.0)}
+"""Of the saved state; `WeakestGroup.read` knows their bounds."""
 
 
-def _numbers(of: Differences) -> dict[str, Any]:
-    return {**of.joint.snapshot(), "load": of.load, "response": of.response, "blocks": of.blocks}
-
-
-def trusted(difference: float, variance: float) -> float:
-    """The share that is used of a difference: a sixteenth of one sd, half of `SEEN` sd, nearly all of many."""
-    ratio = difference**4
-    return ratio / (ratio + (SEEN**2 * variance) ** 2)
+def _trusted(difference: float, sd: float) -> float:
+    """The share that is used of a difference: a sixteenth of one sd, half of `seen_sd`, nearly all of many."""
+    return difference**4 / (difference**4 + (CONFIG.seen_sd * sd) ** 4)

@@ -22,7 +22,7 @@ from gz_onboard.offline.samples import of_ride
 from gz_onboard.pipeline import dbc_texts, lacking
 from gz_onboard.progress import Progress
 from gz_onboard.recording.logs import ESTIMATED, read_metadata
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 
 _RECORD = "gz_onboard.estimate"  # of metadata, at the end of the log: of what the estimates are, and their summary
@@ -66,7 +66,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
         if progress:
             progress(kept.frames)
         return kept
-    route = read_ahead(task.route)[1] if task.route else None
+    route = read_route(task.route) if task.route else None
     ride = open_estimate(task.path, vehicle)
     if task.frames and ride.vehicle.mapping is not vehicle.mapping:
         raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")

@@ -190,7 +190,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
     if how.ledger:
         pipeline.estimator.forecaster.load.ledger = Ledger()
     if how.route:
-        pipeline.estimator.ahead.follow(pipeline.estimator.ahead.ready(how.route))
+        pipeline.estimator.route.follow(pipeline.estimator.route.prepare(how.route))
     if not how.frames:
         pipeline.publisher = _Mute()
     feed(pipeline, ride.frames, progress)

@@ -70,7 +70,7 @@ class RideSummary:
     changes: Annotated[
         list[Why],
         "each change of the range by 1 km more or less than was ridden, and why; its range_km is the range then plus "
-        "what was ridden since reference_km; a charge is one change",
+        "what was ridden since reference_km; a charge is one change, told when it is over",
     ]
     route: Annotated[
         RouteSummary | None,
@@ -126,7 +126,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     """The summary of a ride; log, picture: where its estimates were written and drawn."""
     pipeline, tally, route, went_on = ridden.pipeline, ridden.tally, ridden.how.route, ridden.went_on
     last, ranged = tally.last or Estimate(0.0), tally.ranged or Estimate(0.0)
-    changes = pipeline.estimator.attribution.changes
+    changes = pipeline.estimator.explainer.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     own = pipeline.estimator.signals["bms_state_of_charge"].last  # of the cells
     battery, gauge = pipeline.estimator.battery, tally.gauge

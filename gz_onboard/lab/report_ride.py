@@ -19,7 +19,7 @@ from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.progress import Progress
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 
 TEMPERATURES = ("motor_temperature", "inverter_temperature", "ambient_temperature")
@@ -87,7 +87,7 @@ def report_of(
     progress: Progress | None = None,
 ) -> ReportedRide:
     """Estimate a ride as the daemon would, and read what the estimates do not hold. Raises InputError."""
-    road = read_ahead(route)[1] if route else None
+    road = read_route(route) if route else None
     log = KeptRows()
     ridden = ride_through(open_estimate(source, vehicle), How(route=road, ledger=True), log, progress)
     ledger = ridden.pipeline.estimator.forecaster.load.ledger or Ledger()

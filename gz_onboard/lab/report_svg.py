@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import ceil, cos, floor, hypot, isfinite, log10, radians
 
-from gz_onboard.estimator.route_position import DEGREE
+from gz_onboard.estimator.route_position import METRES_PER_DEGREE
 
 GRAIN = 1000  # columns and lines of a picture: a screen shows no more
 TICKS = 5  # on an axis, about
@@ -129,7 +129,10 @@ def draw_map(runs: Sequence[Sequence[tuple[float, float]]], label: str) -> Map:
     """
     north, west = runs[0][0]
     cosine = cos(radians(sum(run[0][0] for run in runs) / len(runs)))
-    ways = [[(((b - west + 180) % 360 - 180) * cosine * DEGREE, (north - a) * DEGREE) for a, b in run] for run in runs]
+    ways = [
+        [(((b - west + 180) % 360 - 180) * cosine * METRES_PER_DEGREE, (north - a) * METRES_PER_DEGREE) for a, b in run]
+        for run in runs
+    ]
     xs, ys = ([point[i] for way in ways for point in way] for i in (0, 1))
     width = max(max(xs) - min(xs), (max(ys) - min(ys)) / _TALLEST, _LEAST_EXTENT) * (1 + 2 * _MARGIN)
     height = max((max(ys) - min(ys)) * (1 + 2 * _MARGIN), _FLATTEST * width)

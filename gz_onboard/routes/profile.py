@@ -7,8 +7,9 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
-from gz_onboard.errors import InputError
 from gz_onboard.routes.route import Route
+
+STEP_M = 5.0  # at most, between points of a profile
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class SpeedProfile:
     time: tuple[float, ...]
 
     def speed_at(self, distance: float) -> float:
-        """Target speed [m/s] at `distance` [m]; 0 before the begin and past the end."""
+        """Target speed [m/s] at `distance` [m]; 0 before the start and past the end."""
         if not 0.0 <= distance <= self.distance[-1]:
             return 0.0
         i = min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1
@@ -40,29 +41,18 @@ def speed_profile(
     acceleration: float = 1.2,
     deceleration: float = 1.5,
     top_speed: float = math.inf,
-    step: float = 5.0,
 ) -> SpeedProfile:
     """The fastest ride of `route`, from standstill to standstill, within its limits and the rider's.
 
-    At the route's stops it stands, for no time. Speed stays within the speed limit, `top_speed` [m/s] and
+    At the route's stops it comes to a halt, for no time. Speed stays within the speed limit, `top_speed` [m/s] and
     √(lateral_acceleration/|curvature|), everywhere and not only at points; it rises and falls with at most
-    `acceleration` and `deceleration` (all in m/s²). Points are the route's and others between them, at most `step` [m]
-    apart. Raises InputError for a value that is not above 0.
+    `acceleration` and `deceleration` (all in m/s²). Points are the route's and others between them.
     """
-    for name, value, unit in (
-        ("lateral_acceleration", lateral_acceleration, "m/s²"),
-        ("acceleration", acceleration, "m/s²"),
-        ("deceleration", deceleration, "m/s²"),
-        ("top_speed", top_speed, "m/s"),
-        ("step", step, "m"),
-    ):
-        if not value > 0:
-            raise InputError(f"{name}: {value:g} {unit}, must be above 0 {unit}")
     distance = [0.0]
     curve: list[float] = [abs(route.curvature[0])]
     limit: list[float] = []  # square of the speed allowed in each interval
     for i, (d0, d1) in enumerate(pairwise(route.distance)):
-        pieces = max(2, math.ceil((d1 - d0) / step))  # two at least: one interval would be standstill throughout
+        pieces = max(2, math.ceil((d1 - d0) / STEP_M))  # two at least: one interval would be standstill throughout
         fixed = min(route.speed_limit[i], top_speed) ** 2
         for k in range(1, pieces + 1):
             part = k / pieces

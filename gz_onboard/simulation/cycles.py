@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.routes.columns import UNITS, read_columns
+from gz_onboard.routes.columns import METRES_PER_SECOND, read_columns
 
 _GTR2 = "UN GTR No. 2, Annex 5 (the same in Regulation (EU) No 134/2014, Annex II, Appendix 6)"
 _TITLES = {
@@ -112,7 +112,7 @@ def read_cycle(file: Path | str) -> Cycle:
     a time that does not increase, a gap or an uneven step in it, a negative speed, and one above 100 m/s.
     """
     file = Path(file)
-    speeds = {f"speed_{unit}": factor for unit, factor in UNITS.items()}
+    speeds = {f"speed_{unit}": factor for unit, factor in METRES_PER_SECOND.items()}
     columns = read_columns(file, ("time_s", *speeds))
     given = [name for name in speeds if name in columns.values]
     if "time_s" not in columns.values:
@@ -122,7 +122,7 @@ def read_cycle(file: Path | str) -> Cycle:
             f"{file}: must have one of the columns {', '.join(speeds)}, has {' and '.join(given) or 'none'}"
         )
     column = given[0]
-    columns.increasing("time_s", "s")
+    columns.check_increasing("time_s", "s")
     time, values = columns.values["time_s"], columns.values[column]
     step = min(after - before for before, after in pairwise(time))
     for row, (before, after) in enumerate(pairwise(time), start=1):
@@ -171,7 +171,7 @@ def _joined(parts: tuple[Cycle, ...]) -> tuple[tuple[float, ...], tuple[float, .
 def _ece15() -> tuple[float, ...]:
     speeds = [0.0]
     for (t0, v0), (t1, v1) in pairwise(_ECE15):
-        speeds += ((v0 + (v1 - v0) * (t - t0) / (t1 - t0)) * UNITS["kmh"] for t in range(t0 + 1, t1 + 1))
+        speeds += ((v0 + (v1 - v0) * (t - t0) / (t1 - t0)) * METRES_PER_SECOND["kmh"] for t in range(t0 + 1, t1 + 1))
     return tuple(speeds)
 
 
@@ -183,5 +183,5 @@ def _table() -> dict[str, tuple[float, ...]]:
     table = {}
     for column, title in enumerate(header[1:], start=1):
         name, unit = title.rsplit("_", 1)
-        table[name] = tuple(float(row[column]) * UNITS[unit] for row in rows if row[column])
+        table[name] = tuple(float(row[column]) * METRES_PER_SECOND[unit] for row in rows if row[column])
     return table

@@ -12,7 +12,7 @@ from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import read_route
+from gz_onboard.routes.route import Route, read_route
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts.chassis import MODELS
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
@@ -154,7 +154,7 @@ def _kind(path: Path) -> str:
 def _route_plan(path: Path, options: SimulationOptions, roller: Dynamometer | None) -> Plan:
     if options.repeat > 1 or options.until_empty:
         raise InputError(f"{path}: a route is ridden once, as it does not end where it starts; --repeat is for cycles")
-    route = read_route(path)
+    route = _with_heights(path)
     profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
     road = roller or road_table(route.distance, route.grade, route.curvature, options.wind)
@@ -193,6 +193,14 @@ def _ride_plan(path: Path, options: SimulationOptions, vehicle: Vehicle, roller:
     )
 
 
+def _with_heights(file: Path) -> Route:
+    """The route in `file`; InputError if it has no altitudes: a hilly road must not be simulated as level."""
+    route = read_route(file)
+    if not route.grade_known:
+        raise InputError(f"{file}: has no altitudes, which a simulation needs: column altitude_m, or ele in a GPX")
+    return route
+
+
 def route_file(log: Path) -> Path:
     """Where the route of the ride in `log` would be."""
     return log.with_name(f"{ride_name(log)}.route.csv")
@@ -206,7 +214,7 @@ def ridden_road(
         return roller or fit_dynamometer(recorded), recorded.heading_at
     if not route_file(log).is_file():
         return recorded.road(headwind), recorded.heading_at
-    route = read_route(route_file(log))
+    route = _with_heights(route_file(log))
     return road_table(route.distance, route.grade, route.curvature, headwind), route.heading[0]
 
 

@@ -113,13 +113,13 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     reads_vibration = "vibration" in vehicle.model.reads
 
     def observe(estimate: Estimate) -> None:
-        road, speed = pipeline.estimator.road, estimate.speed or 0.0
-        turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
-        rows.append((road.distance, road.grade or 0.0, turning))
-        if road.heading is not None and speed > _MOVING:
-            headings.append((road.distance, road.heading))
+        motion, speed = pipeline.estimator.motion, estimate.speed or 0.0
+        turning = (motion.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
+        rows.append((motion.distance, motion.grade or 0.0, turning))
+        if motion.heading is not None and speed > _MOVING:
+            headings.append((motion.distance, motion.heading))
         if reads_vibration:
-            rough.append((estimate.time, road.distance, pipeline.estimator.vibration(estimate.time)))
+            rough.append((estimate.time, motion.distance, pipeline.estimator.vibration(estimate.time)))
 
     mapping, frames = open_ride(log, vehicle)
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)

@@ -72,7 +72,7 @@ def test_a_scooter_in_a_van_is_parked(witness):
     rest = (1234000.0,) if witness == "odometer" else (0.0, 0.0)
     for event in stand(180, 0.0, 0.0, rest[: len(own.roles)]):
         e.handle(event)
-    before = riding.usual, e.road.distance
+    before = riding.usual, e.motion.distance
     seen = set()
     for event in stand(1200, 180.0, 15.0, rest[: len(own.roles)]):
         e.handle(event)
@@ -83,4 +83,4 @@ def test_a_scooter_in_a_van_is_parked(witness):
     assert riding.usual == before[0]
     if witness != "odometer":  # which shows it only after its longest step
         assert seen == {(Activity.PARKED, ())}
-        assert e.road.distance == before[1]
+        assert e.motion.distance == before[1]

@@ -205,9 +205,9 @@ def test_a_speed_sensor_that_shows_too_much():
     def fast(events):
         return ((t, g, (v[0] * 1.05,) if g == MOTOR else v) for t, g, v in events)
 
-    way = run(BASE, 120)[0].road.distance
-    assert run(BASE, 120, fast)[0].road.distance == pytest.approx(1.05 * way)
-    assert run(extended(speed_sensor_scale=1.05), 120, fast)[0].road.distance == pytest.approx(way)
+    way = run(BASE, 120)[0].motion.distance
+    assert run(BASE, 120, fast)[0].motion.distance == pytest.approx(1.05 * way)
+    assert run(extended(speed_sensor_scale=1.05), 120, fast)[0].motion.distance == pytest.approx(way)
 
 
 # --- the way to come ----------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gz_onboard.estimator.activity import STOP_TIME
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
@@ -100,7 +100,7 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
         assert soon.consumption_expected == pytest.approx(price(), rel=0.1)
     scooter.auxiliary = 400.0
     ride(600, 7.0)
-    why = e.attribution.latest.causes
+    why = e.explainer.latest.causes
     assert why[Cause.AUXILIARIES] < -5000.0
     assert abs(why[Cause.UNEXPLAINED]) < -0.3 * why[Cause.AUXILIARIES]
     saved = json.loads(json.dumps(e.snapshot("a")))
@@ -165,7 +165,7 @@ def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
     follow(e, scooter.live(60), scooter)
     assert ridden() - before == pytest.approx(60, abs=5)
     follow(e, scooter.live(600), scooter)
-    assert ridden() - before == pytest.approx(STOP_TIME, abs=15)  # it comes to a stop first
+    assert ridden() - before == pytest.approx(MOTION.stop_time, abs=15)  # it comes to a stop first
 
 
 @pytest.mark.parametrize(("learned", "true"), [(1.0, 0.8), (0.8, 1.0)])

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from gz_onboard.estimator.route_position import FAR, LEAVING, STAYING, STAYING_AFAR, RoutePosition
+from gz_onboard.estimator.route_position import CONFIG, RoutePosition
 from gz_onboard.routes.route import Route
 
 NORTH, EAST = 111_200.0, 111_200.0 * math.cos(math.radians(40.3))
@@ -57,7 +57,7 @@ def test_it_follows_and_ends(noise):
     for i, along in enumerate(seen[:-5], start=1):
         assert along == pytest.approx(STEP * i, abs=5 + 3 * noise)
     assert not position.on  # at its end there is nothing of it left
-    assert position.along == position._route.length
+    assert position.along == 3500.0
 
 
 def test_a_wrong_odometer_is_mended_by_fixes():
@@ -73,9 +73,9 @@ def test_leaving_is_said_and_rejoining_goes_on_where_it_is():
     seen = ride(position, detour)
     assert seen[99] == pytest.approx(1000, abs=5)
     off = seen.index(None)
-    assert STEP * (off - 99) <= FAR + LEAVING + 2 * STEP
+    assert STEP * (off - 99) <= CONFIG.off + CONFIG.leaving + 2 * STEP
     again = next(i for i in range(off, len(seen)) if seen[i] is not None)
-    assert STEP * again <= 1000 + 400 + 1000 + 400 + STAYING + 40
+    assert STEP * again <= 1000 + 400 + 1000 + 400 + CONFIG.staying + 40
     assert seen[-1] == pytest.approx(3000, abs=5)
     assert all(along is None for along in seen[off:again])
 
@@ -94,7 +94,7 @@ def test_turning_back_early_on_it_goes_on_homeward():
     homeward = [along for along in seen[101:-1] if along is not None]
     assert homeward[-1] == pytest.approx(6000 - 10, abs=30)
     first = seen.index(homeward[0], 101)
-    assert STEP * (first - 100) <= LEAVING + STAYING_AFAR + 60
+    assert STEP * (first - 100) <= CONFIG.leaving + CONFIG.staying_far + 60
 
 
 def test_a_loop_ridden_twice_goes_on_counting():

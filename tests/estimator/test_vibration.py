@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
-from gz_onboard.estimator.vibration import SETTLED, VibrationMonitor
 from gz_onboard.events import WINDOW, Group, RoleWindow
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.sensors import Vibration
@@ -96,9 +96,9 @@ def test_slow_motion_is_no_vibration():
     ("samples", "known"),
     [
         ([], False),
-        (shaken(SETTLED - 1, 1.0), False),  # too small a number yet
-        (shaken(SETTLED + 1, 1.0), True),
-        (shaken(SETTLED + 1, 1.0, step=0.03), True),
+        (shaken(MOTION.vibration_after - 1, 1.0), False),  # too small a number yet
+        (shaken(MOTION.vibration_after + 1, 1.0), True),
+        (shaken(MOTION.vibration_after + 1, 1.0, step=0.03), True),
         (shaken(30, 1.0, step=0.05), False),  # too slow to show it
         ([(0.01 * i, 9.81) for i in range(3000)], False),  # stuck
         ([(0.01 * i, 9.81 + 0.1 * (i % 90 < 45)) for i in range(3000)], True),  # coarse, but alive
@@ -125,7 +125,7 @@ def test_after_a_stuck_sensor_it_begins_anew():
 
 @given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(-60, 60)), max_size=60), st.floats(0, 0.2))
 def test_whatever_comes_it_is_none_or_a_possible_number(steps, after):
-    samples, now = shaken(SETTLED + 1, 1.0, begin=-8.0), 0.0
+    samples, now = shaken(MOTION.vibration_after + 1, 1.0, begin=-8.0), 0.0
     for dt, z in steps:
         now += dt
         samples.append((now, z))
@@ -158,7 +158,7 @@ def modelled(e):
 
 @pytest.fixture(scope="module")
 def quiet(rough):
-    return estimated(rough, events(240, 1e-6))
+    return estimated(rough, events(240, 0.01))
 
 
 def test_the_road_load_is_that_of_the_shaking(rough, quiet):
@@ -238,7 +238,7 @@ def test_what_was_learned_outlives_a_restart(rough):
 def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     """In the cells too it is what is felt, and the typical for the energy left."""
     loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
-    for vibration in (1e-6, 2.5):
+    for vibration in (0.01, 2.5):
         e = estimated(loose, events(60, vibration))
         assert e.soc.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
     settled = e.forecaster._overpotential

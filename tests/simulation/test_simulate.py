@@ -259,7 +259,7 @@ def test_a_route_in_gpx_is_the_one_in_csv(tmp_path, capsys):
     assert told[0]["consumption_wh_km"] == told[1]["consumption_wh_km"] > 0
     (tmp_path / "flat.gpx").write_text((tmp_path / "way.gpx").read_text().replace("ele>", "el>"))
     assert simulate(tmp_path / "flat.gpx", "--output", tmp_path) == 2
-    assert "column altitude_m is missing" in capsys.readouterr().err
+    assert "flat.gpx: has no altitudes" in capsys.readouterr().err
 
 
 def test_a_directory_that_cannot_be_made(short, tmp_path, capsys):

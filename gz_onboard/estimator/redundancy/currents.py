@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from math import sqrt
 
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.redundancy.checks import AGREES, NO_SENSOR, counters, faulty, share_of_new
 from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, CellEvidence, Readings, ResidualComparison
 from gz_onboard.estimator.redundancy.sag import VoltageSag
-from gz_onboard.estimator.road import STANDSTILL
 from gz_onboard.events import CURRENTS
 
 FAST_TIME, SKEW_TIME, MEAN_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensors do not sample at the same time
@@ -97,7 +97,7 @@ class CurrentCheck:
 
     def _wrong_at_rest(self, readings: Readings, pack: float, inverter: float) -> int:
         """1 or 2: which of pack and inverter is wrong at standstill, where only the auxiliary load flows; else 0."""
-        if readings.speed is None or abs(readings.speed) >= STANDSTILL:
+        if readings.speed is None or abs(readings.speed) >= MOTION.standstill:
             return 0
         off = abs(pack - readings.usual_auxiliary), abs(inverter - readings.usual_auxiliary)
         if max(off) <= TWICE * min(off) + AGREES * (APART * self._capacity):

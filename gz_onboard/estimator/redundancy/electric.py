@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.redundancy.checks import share_of_new
-from gz_onboard.estimator.road import STANDSTILL
 
 ERROR_TIME, ERROR_LEAST = 10.0, 0.04  # s, V: what the cell model leaves, low-passed
 CLEARLY = 2.5  # of two mean squares: the greater one's reading is wrong,
@@ -40,7 +40,7 @@ class Readings(NamedTuple):
 
     def unconnected(self, least: float) -> bool:
         """Whether an idle inverter is below the pack of a standing vehicle by `least` [V]."""
-        if self.pack_voltage is None or self.inverter_voltage is None or abs(self.speed or 0.0) > STANDSTILL:
+        if self.pack_voltage is None or self.inverter_voltage is None or abs(self.speed or 0.0) > MOTION.standstill:
             return False
         idle = self.inverter is None or abs(self.inverter) <= self.usual_auxiliary
         return idle and self.inverter_voltage < self.pack_voltage - least
@@ -48,7 +48,7 @@ class Readings(NamedTuple):
     @property
     def charging(self) -> bool:
         """A charger's current does not pass the inverter."""
-        return self.pack is not None and self.pack < 0 and abs(self.speed or 0.0) < STANDSTILL
+        return self.pack is not None and self.pack < 0 and abs(self.speed or 0.0) < MOTION.standstill
 
 
 class CellEvidence(NamedTuple):

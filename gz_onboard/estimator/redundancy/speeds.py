@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from statistics import fmean, median
 
+from gz_onboard.estimator.motion import MOTION, accelerated
 from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
-from gz_onboard.estimator.road import SPEED_TIME, accelerated
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import SPEEDS
 from gz_onboard.physics.sensors import speed_factors
@@ -180,8 +180,8 @@ class SpeedCheck:
         keep = 1 - min(step.observed / HELD_TIME, 1.0)
         for role in self.reporting:
             self._held[role] = max(step.now - step.signals[role].time, keep * self._held[role])
-        longest = min(self._held[role] for role in speeds) + SPEED_TIME
-        self.in_steps = longest > 2 * SPEED_TIME
+        longest = min(self._held[role] for role in speeds) + MOTION.speed_time
+        self.in_steps = longest > 2 * MOTION.speed_time
         return median(speed for role, speed in speeds.items() if self._held[role] <= longest)
 
     def _follow(self, dt: float, speed: float) -> None:

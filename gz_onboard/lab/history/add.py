@@ -26,7 +26,7 @@ from gz_onboard.offline.samples import facts_of, ride_name
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.logs import log_suffix, logs_among, read_metadata, read_samples
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, find_vehicle
 
 
@@ -188,7 +188,7 @@ def rides_in(task: HistoryTask, known: Callable[[], Vehicle], progress: Progress
             )
             return LogRides(rides_of(moments, whys, about), damages[0] if damages else None)
     vehicle = known()
-    road = read_ahead(task.route)[1] if task.route else None
+    road = read_route(task.route) if task.route else None
     log = KeptRows()
     ridden = ride_through(open_estimate(task.path, vehicle), How(route=road), log, progress)
     route = task.route.name if task.route else None

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.attribution import Attribution, Moment
+from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, EffectInputs
 from gz_onboard.estimator.signals import Signals
@@ -51,10 +51,10 @@ def ride(
 
 
 def explained(f: Forecaster, *, soc: float = 0.7, cells: float = 20.0, air: Conditions = MILD) -> Explanation:
-    attribution = Attribution(f, Signals(()))
+    explainer = RangeExplainer(f, Signals(()))
     result = f.forecast(soc, 0.01, cells, 1.0, air.ambient, air.altitude)
-    attribution.take(Moment(0.0, result, soc, air, 0.0))
-    why = attribution.latest
+    explainer.take(0.0, result, soc, air, 0.0)
+    why = explainer.latest
     assert why is not None
     assert why.range == pytest.approx(result.range)
     return why
@@ -81,16 +81,16 @@ STATES = st.tuples(st.floats(-0.05, 1.05), st.floats(-20.0, 45.0), st.floats(-20
 @given(RIDINGS, STATES, STATES, st.one_of(st.none(), st.floats(40.0, 200.0)))
 def test_the_causes_add_up(riding, first, then, payload):
     f = forecaster(VEHICLE if payload is None else read_vehicle("reference", payload))
-    attribution, distance = Attribution(f, Signals(())), 0.0
+    explainer, distance = RangeExplainer(f, Signals(())), 0.0
     for time, (soc, cells, ambient, altitude) in enumerate((first, then)):
         air = Conditions(ambient, altitude)
         result = f.forecast(soc, 0.01, cells, 1.0, ambient, altitude)
-        attribution.take(Moment(1000.0 * time, result, soc, air, distance))
+        explainer.take(1000.0 * time, result, soc, air, distance)
         distance += ride(f, **riding)
-    why = attribution.latest
+    why = explainer.latest
     assert why is not None
     check_sum(why)
-    for change in attribution.changes:
+    for change in explainer.changes:
         check_sum(change)
         assert abs(change.range - change.reference) > 1000.0
 
@@ -109,13 +109,13 @@ def against(f: Forecaster, usual: Forecaster, **state: float) -> Explanation:
     """The range of `f` against that of `usual`, which differs in one thing."""
     results = []
     for each in (usual, f):
-        attribution = Attribution(each, Signals(()))
+        explainer = RangeExplainer(each, Signals(()))
         ambient, soc, cells = state.get("ambient", 20.0), state.get("soc", 0.7), state.get("cells", 20.0)
         if each is usual:
             ambient = cells = 20.0
         result = each.forecast(soc, 0.01, cells, 1.0, ambient, 0.0)
-        results.append(attribution._state(Moment(0.0, result, soc, Conditions(ambient, 0.0), 0.0)))
-    return Attribution(f, Signals(())).explained(*results)
+        results.append(explainer.state(0.0, result, soc, Conditions(ambient, 0.0), 0.0))
+    return RangeExplainer(f, Signals(())).explain(*results)
 
 
 def ridden(**riding: float) -> Forecaster:
@@ -210,15 +210,15 @@ def test_a_heater_is_told_from_what_nobody_knows():
     """Both are in the consumption factor; the power of one is measured."""
     f = forecaster()
     signals = Signals([("heater_power", 10.0)])
-    attribution, heater, x = Attribution(f, signals), 150.0, 0.0
+    explainer, heater, x = RangeExplainer(f, signals), 150.0, 0.0
     for second in range(900):
         v = 10.0
         signals.heater_power.value, signals.heater_power.time = heater, float(second)
         f.ride(1.0, v, 0.0, f.load.power(f.load.quantities(v, 0.0, MILD)) + heater, MILD)
         x += v
         result = f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0)
-        attribution.take(Moment(float(second), result, 0.7, MILD, x))
-    why = attribution.latest
+        explainer.take(float(second), result, 0.7, MILD, x)
+    why = explainer.latest
     assert why is not None
     check_sum(why)
     assert why.causes[Cause.AUXILIARIES] < -2000.0
@@ -230,74 +230,71 @@ def test_a_heater_is_told_from_what_nobody_knows():
 
 def test_a_cause_that_did_not_change_has_no_part_in_a_change():
     f = forecaster()
-    attribution = Attribution(f, Signals(()))
+    explainer = RangeExplainer(f, Signals(()))
     for time, soc in enumerate((0.7, 0.6)):
-        attribution.take(
-            Moment(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
-        )
-    (change,) = attribution.changes
+        explainer.take(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
+    (change,) = explainer.changes
     moved = {cause for cause, size in change.causes.items() if abs(size) > 1.0}
     assert moved == {Cause.CHARGE, Cause.TEMPERATURE}  # with less charge the cells have less time to warm
     assert change.causes[Cause.CHARGE] == pytest.approx(change.range - change.reference, rel=0.1)
     check_sum(change)
 
 
-def test_a_charge_is_one_change_of_which_the_news_has_each_step():
+def test_a_charge_is_one_change_explained_when_it_is_over():
     f = forecaster()
-    attribution = Attribution(f, Signals(()))
-    way = [(0.9, 0.0), (0.5, 1000.0), *((0.5 + 0.1 * i, 1000.0) for i in range(1, 5)), (0.4, 2000.0), (0.6, 2000.0)]
+    explainer = RangeExplainer(f, Signals(()))
+    way = [(0.9, 0.0), (0.5, 1000.0), *((0.5 + 0.1 * i, 1000.0) for i in range(1, 5)), (0.89, 1000.0), (0.4, 2000.0)]
     for i, (soc, ridden) in enumerate(way):
         forecast = f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0)
-        attribution.take(Moment(100.0 * i, forecast, soc, MILD, ridden))
-    used, charged, used_again, charged_again = attribution.changes
-    assert len([change for is_change, change in attribution.news() if is_change]) == 7
+        explainer.take(100.0 * i, forecast, soc, MILD, ridden, charging=1 < i < 6)
+    used, charged, used_again = explainer.changes
+    assert [is_change for is_change, _ in explainer.news()].count(True) == 3
     assert used.causes[Cause.CHARGE] < 0 < charged.causes[Cause.CHARGE]
     assert charged.reference == pytest.approx(used.range - 1000.0)
     assert charged.range == pytest.approx(used_again.reference)
-    assert charged.time == 500.0
-    assert charged_again.causes[Cause.CHARGE] > 0
-    for change in attribution.changes:
+    assert charged.time == 600.0
+    for change in explainer.changes:
         check_sum(change)
 
 
 def test_what_is_ridden_as_expected_is_no_change():
     f = forecaster()
-    attribution = Attribution(f, Signals(()))
+    explainer = RangeExplainer(f, Signals(()))
     first = f.forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0)
-    attribution.take(Moment(0.0, first, 0.8, MILD, 0.0))
+    explainer.take(0.0, first, 0.8, MILD, 0.0)
     then = f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
-    attribution.take(Moment(500.0, then, 0.6, MILD, first.range - then.range))
-    assert not attribution.changes
+    explainer.take(500.0, then, 0.6, MILD, first.range - then.range)
+    assert not explainer.changes
 
 
 def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
     f = forecaster()
     ride(f, 3)
-    attribution = Attribution(f, Signals(()))
+    explainer = RangeExplainer(f, Signals(()))
 
     def take(now: float) -> None:
-        attribution.take(Moment(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0))
+        explainer.take(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
 
     take(0.0)
     ride(f, 1.5, factor=2.5)
     take(100.0)
     f.forget(1500.0)
-    attribution.forget({"pack_voltage"})
+    explainer.forget({"pack_voltage"})
     take(200.0)
     ride(f, 1.5, factor=2.5)
     take(300.0)
-    assert [change.forgotten for change in attribution.changes] == [(), ("pack_voltage",), ()]
-    assert [explanation_row(change).get("forgotten") for change in attribution.changes] == [None, "pack_voltage", None]
+    assert [change.forgotten for change in explainer.changes] == [(), ("pack_voltage",), ()]
+    assert [explanation_row(change).get("forgotten") for change in explainer.changes] == [None, "pack_voltage", None]
 
 
 def test_the_split_is_made_seldom_and_not_of_a_range_that_stays():
     f = forecaster()
-    attribution = Attribution(f, Signals(()))
+    explainer = RangeExplainer(f, Signals(()))
     for second in range(400):
         soc = 0.8 - second * 1e-6
-        attribution.take(Moment(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0))
-    assert len(attribution.news()) == 1
-    assert attribution.news() == []
+        explainer.take(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0)
+    assert len(explainer.news()) == 1
+    assert explainer.news() == []
 
 
 def test_what_was_ridden_survives_a_restart():

@@ -1,58 +1,52 @@
-"""What the model gives for the present motion."""
+"""Inputs of the forward model for the present motion, collected from the parts that hold them."""
 
 from __future__ import annotations
 
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import WARM_MOTOR, Conditions, EffectInputs
-from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.motion import Motion, VibrationMonitor
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.temperatures import Temperatures
-from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.physics.battery import HALF_FULL
 
 
-class Present:
-    """The present inputs of the model, collected from the parts that hold them. All methods take the time [s]."""
+class ModelInputs:
+    """Present inputs of the model, and the power that it gives. All methods take the time [s]."""
 
     def __init__(
         self,
         forecaster: Forecaster,
-        road: RoadState,
+        motion: Motion,
         temperatures: Temperatures,
         soc: StateOfCharge,
         monitor: VibrationMonitor | None,
     ) -> None:
         """`monitor`: for a model that reads the vibration."""
         self._forecaster, self._load = forecaster, forecaster.load
-        self._road, self._temperatures, self._soc, self._monitor = road, temperatures, soc, monitor
+        self._motion, self._temperatures, self._soc, self._monitor = motion, temperatures, soc, monitor
 
     def conditions(self, now: float, motor_temperature: float | None = None) -> Conditions:
-        """`motor_temperature` in degC, if it is known."""
+        """Air and motor; `motor_temperature` in degC, if it is known."""
         motor = WARM_MOTOR if motor_temperature is None else motor_temperature
-        return Conditions(self._temperatures.ambient(now), self._road.altitude or 0.0, motor)
-
-    @property
-    def time_moving(self) -> float:
-        """See `QUANTITIES` [s]."""
-        return self._forecaster.riding.time_moving
+        return Conditions(self._temperatures.ambient(now), self._motion.altitude or 0.0, motor)
 
     def power(self, now: float) -> float:
-        """What the pack gives [W]."""
-        road = self._road
-        return self.power_at(now, road.speed or 0.0, road.acceleration or 0.0, road.grade or 0.0)
+        """Power that the pack gives [W]."""
+        motion = self._motion
+        return self.power_at(now, motion.speed or 0.0, motion.acceleration or 0.0, motion.grade or 0.0)
 
     def power_at(self, now: float, speed: float, acceleration: float, grade: float = 0.0) -> float:
-        """What the pack would give [W] at this speed [m/s], acceleration [m/s²] and grade (sine)."""
+        """Power that the pack would give [W] at this speed [m/s], acceleration [m/s²] and grade (sine)."""
         conditions = self.conditions(now)
         quantities = self._load.quantities(speed, acceleration, conditions)
         quantities["grade"] = grade
         if inputs := self.effect_inputs(now):
-            self._load.extend(quantities, inputs, conditions.ambient, self.time_moving)
+            self._load.extend(quantities, inputs, conditions.ambient, self._forecaster.riding.time_moving)
         return self._load.power(quantities)
 
     def power_of_prior(self, now: float) -> float:
-        """Of the riding before the first voltage [W]: the prior's, or, where it rides faster, at its speed."""
-        conditions, speed = self.conditions(now), self._road.speed or 0.0
+        """Power of the riding before the first voltage [W]: the prior's, or, where it rides faster, at its speed."""
+        conditions, speed = self.conditions(now), self._motion.speed or 0.0
         power, usual = self._load.prior_ride(conditions.ambient, conditions.altitude)
         return max(power, self.power_at(now, speed, 0.0)) if speed > usual else power
 
@@ -60,11 +54,10 @@ class Present:
         """What effects beyond the base's may read; None if the model has none."""
         if not self._load.extended:
             return None
-        road, filter_ = self._road, self._soc.filter
-        lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
+        motion, filter_ = self._motion, self._soc.filter
         return EffectInputs(
-            lateral,
-            road.heading,
+            None if motion.yaw_rate is None or motion.speed is None else motion.speed * motion.yaw_rate,
+            motion.heading,
             filter_.soc if filter_ else HALF_FULL,
             self._temperatures.cells_or_bench,
             self._soc.current or 0.0,
@@ -72,11 +65,11 @@ class Present:
         )
 
     def cell_inputs(self, now: float) -> dict[str, float]:
-        """What effects in the cells may read beside the cells' own."""
+        """Inputs of effects in the cells, apart from those of the cells themselves."""
         inputs = {"time_moving": self._forecaster.riding.time_moving}
         return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
 
     def vibration(self, now: float) -> float:
         """What effects read as ``vibration`` [m/s²]: the typical value while it is not known."""
         value = self._monitor.value(now) if self._monitor else None
-        return self._load.typical_vibration(self._road.speed or 0.0) if value is None else value
+        return self._load.typical_vibration(self._motion.speed or 0.0) if value is None else value

@@ -1,4 +1,4 @@
-"""The road state, on motions whose truth is known."""
+"""The motion, on motions whose truth is known."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.road import RoadState, accelerated
+from gz_onboard.estimator.motion import Motion, accelerated
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES, RoleWindow
 
 RADIUS = 0.2438
 
 
-def drive(seconds, motion, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
-    """Run the filter over `motion`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
+def drive(seconds, truth, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
+    """Run the filter over `truth`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
     rng = np.random.default_rng(seed)
     signals = Signals((role, 2.0) for role in ROLES if role not in without)
-    road = RoadState()
-    heading, rows, before = 0.0, [], motion(0.0)
+    motion = Motion()
+    heading, rows, before = 0.0, [], truth(0.0)
     for step in range(1, round(seconds / dt) + 1):
         t = step * dt
-        speed, grade, lean, yaw, altitude = motion(t)
+        speed, grade, lean, yaw, altitude = truth(t)
         heading = (heading - yaw * dt) % (2 * pi)
         values = {
             "motor_speed": speed / RADIUS,
@@ -39,22 +39,23 @@ def drive(seconds, motion, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
         for role, value in values.items():
             if role not in without and (role != "gps_altitude" or t < altitude_until):
                 signals[role].take(RoleWindow(t, value, 1, value))
-        road.step(t, dt, signals, RADIUS, 1.0)
+        motion.step(t, dt, signals, RADIUS, 1.0)
         signals.next_window()
         before = (speed, grade, lean, yaw, altitude)
-        rows.append((t, road.speed, road.grade, road.lean, road.yaw_rate, road.heading, grade, lean, yaw, heading))
-    return road, rows
+        found = t, motion.speed, motion.grade, motion.lean, motion.yaw_rate, motion.heading
+        rows.append((*found, grade, lean, yaw, heading))
+    return motion, rows
 
 
 def test_an_accelerometer_alone_shows_no_grade_before_an_altitude_has_levelled_it():
     def level(t):
         return min(9.0, t), 0.0, 0.0, 0.0, 100.0
 
-    road, rows = drive(120, level, without=("gps_altitude",))
-    assert road.speed is not None
+    motion, rows = drive(120, level, without=("gps_altitude",))
+    assert motion.speed is not None
     assert all(row[2] is None for row in rows), "its mounting would be a hill"
-    road, rows = drive(120, level)
-    assert road.grade == pytest.approx(0.0, abs=0.02)
+    motion, rows = drive(120, level)
+    assert motion.grade == pytest.approx(0.0, abs=0.02)
 
 
 def turning(t):
@@ -67,15 +68,15 @@ def turning(t):
 
 
 def test_a_gyro_with_a_large_offset_is_learned_at_rest():
-    road = RoadState()
+    motion = Motion()
     signals = Signals((role, 2.0) for role in ROLES)
     for step in range(1, 300):
         for role, value in (("motor_speed", 0.0), ("rate_x", 0.1), ("rate_z", -0.12), ("accel_y", 0.0)):
             signals[role].take(RoleWindow(step * 0.1, value, 1, value))
-        road.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
+        motion.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
         signals.next_window()
-    assert road.bias_x == pytest.approx(0.1, abs=0.005)
-    assert road.bias_z == pytest.approx(-0.12, abs=0.005)
+    assert motion.gyro_bias[0] == pytest.approx(0.1, abs=0.005)
+    assert motion.gyro_bias[1] == pytest.approx(-0.12, abs=0.005)
 
 
 def test_lean_and_yaw_in_curves():
@@ -111,27 +112,27 @@ def test_grade_of_hills(without, altitude_until, worst):
 
 
 def test_without_any_source_a_quantity_is_none():
-    road, _ = drive(30, turning, without=("rate_x", "rate_z", "accel_x", "gps_altitude", "gps_course", "gps_speed"))
-    assert road.lean is None
-    assert road.yaw_rate is None
-    assert road.grade is None
-    assert road.heading is None
-    assert road.speed == pytest.approx(0.0)
+    motion, _ = drive(30, turning, without=("rate_x", "rate_z", "accel_x", "gps_altitude", "gps_course", "gps_speed"))
+    assert motion.lean is None
+    assert motion.yaw_rate is None
+    assert motion.grade is None
+    assert motion.heading is None
+    assert motion.speed == pytest.approx(0.0)
 
 
 def test_speed_by_whatever_there_is():
     for missing in (("motor_speed",), ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed")):
-        road, _ = drive(60, hill, without=missing)
-        assert road.speed == pytest.approx(8.0)
+        motion, _ = drive(60, hill, without=missing)
+        assert motion.speed == pytest.approx(8.0)
     everything = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
-    road, _ = drive(60, hill, without=everything)
-    assert road.speed is None
-    assert road.acceleration is None
+    motion, _ = drive(60, hill, without=everything)
+    assert motion.speed is None
+    assert motion.acceleration is None
 
 
 def test_distance_and_steady_turn_sign():
-    road, _ = drive(100, hill)
-    assert road.distance == pytest.approx(800, rel=0.01)
+    motion, _ = drive(100, hill)
+    assert motion.distance == pytest.approx(800, rel=0.01)
     assert tan(-atan(9 * 0.35 / GRAVITY)) < 0
 
 

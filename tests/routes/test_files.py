@@ -1,4 +1,4 @@
-"""Files of the road ahead: GPX and CSV, and what of them is refused."""
+"""Route files: GPX and CSV, and what of them is refused."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import gzip
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.routes.ahead import LARGEST_FILE, read_ahead
+from gz_onboard.routes.columns import MAX_BYTES
 from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import MOST_POINTS
+from gz_onboard.routes.route import CONFIG, read_route, read_route_columns
 
 HEAD = '<?xml version="1.0"?>\n<gpx xmlns="http://www.topografix.com/GPX/1/1">\n'
 
@@ -27,7 +27,7 @@ def gpx(folder, points, kind="trkpt"):
 @pytest.mark.parametrize("kind", ["trkpt", "rtept"])
 def test_a_gpx_is_read(tmp_path, kind):
     points = [(47.0 + 0.0002 * i, 8.0, 400.0 + 0.5 * i) for i in range(40)]
-    route = read_ahead(gpx(tmp_path, points, kind))[1]
+    route = read_route(gpx(tmp_path, points, kind))
     assert (route.name, route.grade_known) == ("way", True)
     assert route.length == pytest.approx(39 * 22.236, rel=1e-3)
     assert route.grade == pytest.approx([0.5 / 22.236] * 40, rel=1e-2)
@@ -36,23 +36,22 @@ def test_a_gpx_is_read(tmp_path, kind):
 
 def test_without_most_altitudes_it_is_level_and_says_so(tmp_path):
     points = [(47.0 + 0.0002 * i, 8.0, None if i % 2 else 400.0 + i) for i in range(40)]
-    route = read_ahead(gpx(tmp_path, points))[1]
+    route = read_route(gpx(tmp_path, points))
     assert not route.grade_known
     assert set(route.grade) == {0.0}
 
 
-@pytest.mark.parametrize("held", [None, 0.0, 90.0, -9999.0])
-@pytest.mark.parametrize("rows", [[0], [7], [39], [3, 20], [0, 1, 2], [19, 20, 21]])
-def test_a_hole_in_the_heights_is_filled_and_said(tmp_path, caplog, held, rows):
-    """A run of zeros is one, too; of other heights that would be a road of its own."""
-    rows = rows if held in (None, 0.0) else [*rows[:1], *rows[3:]]
+@pytest.mark.parametrize("held", [None, 0.0, -9999.0])
+@pytest.mark.parametrize("rows", [[0], [7], [39], [3, 20], [0, 1, 2], [19, 20, 21], list(range(12, 30))])
+def test_missing_heights_are_filled_with_a_warning(tmp_path, caplog, held, rows):
+    """A height of 0 is a missing one, too, unless others are near sea level."""
     points = [(47.0 + 0.0002 * i, 8.0, held if i in rows else 142.0 + 0.5 * i) for i in range(40)]
-    columns, route = read_ahead(gpx(tmp_path, points))
+    file = gpx(tmp_path, points)
+    columns, route = read_route_columns(file), read_route(file)
     assert route.grade_known
     assert route.grade == pytest.approx([0.5 / 22.236] * 40, abs=0.008)
     assert columns.values["altitude_m"][19] == pytest.approx(151.5, abs=2)
-    line = 3 + rows[0]
-    assert f"way.gpx:{line}: {len(rows)} of 40 heights are missing or leap" in caplog.text
+    assert f"way.gpx: point {rows[0] + 1}: {len(rows)} of 40 heights are missing" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -60,7 +59,7 @@ def test_a_hole_in_the_heights_is_filled_and_said(tmp_path, caplog, held, rows):
 )
 def test_heights_of_a_road_are_left_alone(tmp_path, caplog, heights):
     points = [(47.0 + 0.0002 * i, 8.0, z) for i, z in enumerate(heights)]
-    assert read_ahead(gpx(tmp_path, points))[0].values["altitude_m"] == tuple(heights)
+    assert read_route_columns(gpx(tmp_path, points)).values["altitude_m"] == tuple(heights)
     assert not caplog.text
 
 
@@ -81,29 +80,29 @@ def in_two(folder, first, second, around):
 @pytest.mark.parametrize("around", AROUND)
 def test_parts_that_do_not_join_are_refused(tmp_path, around):
     away = [(y + 0.03, x, z) for y, x, z in PART]
-    told = r"way\.gpx:23: has 2 tracks or segments, which do not join: 2\.9 km lie before this one"
+    told = r"way\.gpx: point 21: has 2 tracks or segments, which do not join: 2\.9 km lie before this one"
     with pytest.raises(InputError, match=told):
-        read_ahead(in_two(tmp_path, PART, away, around))
+        read_route(in_two(tmp_path, PART, away, around))
 
 
 @pytest.mark.parametrize("around", AROUND)
 def test_parts_that_join_are_one_road(tmp_path, around):
     on = [(y + 0.0043, x, z) for y, x, z in PART]  # 56 m further on
-    route = read_ahead(in_two(tmp_path, PART, on, around))[1]
+    route = read_route(in_two(tmp_path, PART, on, around))
     assert route.length == pytest.approx(0.0081 * 111_180, rel=1e-3)
 
 
 def test_a_track_that_stood_is_passed_over(tmp_path):
     points = [(47.0 + 0.0002 * max(i - 5, 0), 8.0, 400.0) for i in range(12)]
-    assert len(read_ahead(gpx(tmp_path, points))[1].distance) == 7
+    assert len(read_route(gpx(tmp_path, points)).distance) == 7
 
 
-def test_stops_winds_and_temperatures_of_a_csv(tmp_path):
-    rows = "".join(f"{20 * i},{30 if i == 10 else 0},3,-5\n" for i in range(20))
+def test_stops_and_winds_of_a_csv(tmp_path):
+    rows = "".join(f"{20 * i},{30 if i == 10 else 0},3\n" for i in range(20))
     file = tmp_path / "way.route.csv"
-    file.write_text("distance_m,stop_s,headwind_mps,temperature_degc\n" + rows)
-    route = read_ahead(file)[1]
-    assert (route.stop[10], route.headwind[3], route.temperature[4]) == (30.0, 3.0, -5.0)
+    file.write_text("distance_m,stop_s,headwind_mps\n" + rows)
+    route = read_route(file)
+    assert (route.stop[10], route.headwind[3]) == (30.0, 3.0)
     profile = speed_profile(route, top_speed=12.0)
     assert profile.speed_at(200.0) == 0.0
     assert profile.speed_at(190.0) > 3.0
@@ -114,17 +113,20 @@ def test_stops_winds_and_temperatures_of_a_csv(tmp_path):
     [
         ([], r"way\.gpx: has 0 points"),
         ([(47.0, 8.0, 1.0)], r"way\.gpx: has 1 points"),
-        ([(47.0, 8.0, 1.0), (48.0, 8.0, 1.0)], r"way\.gpx:4: is 111\.2 km from the point before: that is no road"),
-        ([(47.0, 8.0, 1.0), (97.0, 8.0, 1.0)], r"way\.gpx:4: latitude_deg: 97 deg is outside"),
-        ([(47.0, 8.0, 1.0), ("x", 8.0, 1.0)], r"way\.gpx:4: lat: 'x' is not a number"),
-        ([(47.0, 8.0, 1.0), (47.001, "nan", 1.0)], r"way\.gpx:4: lon: 'nan' is not a number"),
-        ([(47.0, 8.0, 1.0), (47.001, 8.0, 90000.0)], r"way\.gpx:4: altitude_m: 90000 m is outside"),
-        ([(47.0, 8.0, 1.0), (47.001, 8.0, 900.0)], r"way\.gpx:3: altitude_m: a grade of 809 %"),
+        (
+            [(47.0, 8.0, 1.0), (48.0, 8.0, 1.0)],
+            r"way\.gpx: point 2: is 111\.2 km from the point before: that is no road",
+        ),
+        ([(47.0, 8.0, 1.0), (97.0, 8.0, 1.0)], r"way\.gpx: point 2: latitude_deg: 97 deg is outside"),
+        ([(47.0, 8.0, 1.0), ("x", 8.0, 1.0)], r"way\.gpx: point 2: lat: 'x' is not a number"),
+        ([(47.0, 8.0, 1.0), (47.001, "nan", 1.0)], r"way\.gpx: point 2: lon: must be a finite number"),
+        ([(47.0, 8.0, 1.0), (47.001, 8.0, 90000.0)], r"way\.gpx: point 2: altitude_m: 90000 m is outside"),
+        ([(47.0, 8.0, 1.0), (47.001, 8.0, 900.0)], r"way\.gpx: point 1: altitude_m: a grade of 809 %"),
     ],
 )
 def test_gpx_refused(tmp_path, points, message):
     with pytest.raises(InputError, match=message):
-        read_ahead(gpx(tmp_path, points))
+        read_route(gpx(tmp_path, points))
 
 
 @pytest.mark.parametrize(
@@ -141,37 +143,40 @@ def test_what_is_no_gpx_is_refused(tmp_path, text, message):
     file = tmp_path / "way.gpx"
     file.write_text(text)
     with pytest.raises(InputError, match=message):
-        read_ahead(file)
+        read_route(file)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 kmh is outside"),
-        ("distance_m,temperature_degc\n0,20\n20,293\n", r":3: temperature_degc: 293 degC is outside"),
+        ("distance_m,headwind_mps\n0,20\n20,293\n", r":3: headwind_mps: 293 m/s is outside"),
         ("distance_m,stop\n0,20\n20,293\n", r":1: unknown column 'stop' \(did you mean 'stop_s'\?\)"),
         ("distance_m\n" + "".join(f"{4000 * i}\n" for i in range(252)), r"is 1004 km long, must be at most 1000"),
-        ("distance_m\n0\n20\n20.0001\n", r":4: distance_m: 20\.0001 m is less than 0\.001 m from the point before"),
-        ("distance_m\n0\n5e-324\n", r":3: distance_m: 4.94066e-324 m is less than 0\.001 m from the point before"),
+        ("distance_m\n0\n20\n20.0001\n", r":4: distance_m: 20\.0001 m does not increase"),
+        ("distance_m\n0\n5e-324\n", r":3: distance_m: 4.94066e-324 m does not increase"),
         ("distance_m\n0\n20000\n", r":3: is 20\.0 km from the point before"),
-        ("distance_m\n" + "".join(f"{i}\n" for i in range(MOST_POINTS + 1)), rf"has {MOST_POINTS + 1} points, must"),
+        (
+            "distance_m\n" + "".join(f"{i}\n" for i in range(CONFIG.max_points + 1)),
+            rf"has {CONFIG.max_points + 1} points, must",
+        ),
     ],
 )
 def test_csv_refused(tmp_path, text, message):
     file = tmp_path / "way.route.csv"
     file.write_text(text)
     with pytest.raises(InputError, match=message):
-        read_ahead(file)
+        read_route(file)
 
 
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match=r"gone\.gpx: cannot be read: No such file"):
-        read_ahead(tmp_path / "gone.gpx")
+        read_route(tmp_path / "gone.gpx")
 
 
 def test_a_packed_file_that_unpacks_to_a_huge_one_is_refused_before_it_is_parsed(tmp_path, monkeypatch):
     file = tmp_path / "way.csv.gz"
-    file.write_bytes(gzip.compress(b"distance_m\n" + b"\n" * LARGEST_FILE, 1))
+    file.write_bytes(gzip.compress(b"distance_m\n" + b"\n" * MAX_BYTES, 1))
     monkeypatch.setattr(csv, "reader", None)
     with pytest.raises(InputError, match=r"way\.csv\.gz: has more than 50 MB, unpacked"):
-        read_ahead(file)
+        read_route(file)
