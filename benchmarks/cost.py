@@ -20,7 +20,7 @@ RIDE = Path(__file__).resolve().parents[1] / "replay_logs" / "city_14C.blf"
 REPEATS = 3
 PARTS = {
     "battery filter, a step": ("gz_onboard.estimator.soc", "StateOfCharge.step"),
-    "sensor checks, a step": ("gz_onboard.estimator.redundancy.monitor", "Redundancy.step"),
+    "sensor checks, a step": ("gz_onboard.estimator.plausibility", "Plausibility.step"),
     "forecast": ("gz_onboard.estimator.forecast", "Forecaster.forecast"),
 }
 """Where each part is: a module and a method."""

@@ -2,8 +2,8 @@
 
 No I/O and no clock: time arrives with the windows, so the same windows give the same estimates, to the last bit.
 All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
-check the sensors (`redundancy`), follow the motion (`motion`), choose the pack's voltage and current (`sources`) and
-the temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
+check the sensors and choose the pack's voltage and current (`plausibility`), follow the motion (`motion`), choose the
+temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
 """
 
 from __future__ import annotations
@@ -17,21 +17,31 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.model_inputs import ModelInputs
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
 from gz_onboard.estimator.outlook import Now, Outlook
+from gz_onboard.estimator.plausibility import Plausibility
+from gz_onboard.estimator.plausibility.electrical import CellEvidence
+from gz_onboard.estimator.plausibility.residual import StepInputs
 from gz_onboard.estimator.reasons import DEGRADING, MissingSignals, loss_variance
-from gz_onboard.estimator.redundancy.checks import StepInputs
-from gz_onboard.estimator.redundancy.electric import CellEvidence
-from gz_onboard.estimator.redundancy.monitor import Redundancy
-from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import VERSION, check_snapshot
 from gz_onboard.estimator.soc import StateOfCharge
-from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
+from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState
 from gz_onboard.estimator.start import read_saved
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import COARSE, SLOWEST, MessageTiming
 from gz_onboard.estimator.weakest import WeakestGroup
-from gz_onboard.events import NO_PACK, STALE_PERIODS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
+from gz_onboard.events import (
+    NO_PACK,
+    SPEEDS,
+    STALE_PERIODS,
+    WINDOW,
+    Activity,
+    Estimate,
+    Group,
+    MessageWindow,
+    Reason,
+    State,
+)
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model
@@ -74,7 +84,7 @@ class Estimator:
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         self._timing = MessageTiming(groups, self._slots)
-        self._speeds = _carrying(SpeedCheck.ROLES, groups)[:1]
+        self._speeds = _carrying(SPEEDS, groups)[:1]
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
@@ -86,10 +96,9 @@ class Estimator:
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
-        self.redundancy = Redundancy(self._radius, self._gear, model.mass, self.forecaster.load.usual_force(), battery)
-        self._sources = PackSources(self.signals, self.redundancy, battery, p)
+        self.plausibility = Plausibility(self.signals, battery, p, model.mass)
         self._temperatures = Temperatures(self.signals, p)
-        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.redundancy.currents.sag)
+        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.plausibility.pack.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
         self._inputs = ModelInputs(self.forecaster, self.motion, self._temperatures, self.soc, self._vibration)
 
@@ -131,7 +140,7 @@ class Estimator:
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
-        self.redundancy.step(StepInputs(now, dt, elapsed, signals, motion.speed))
+        self.plausibility.step(StepInputs(now, dt, elapsed, signals, motion.speed))
         motion.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
@@ -180,7 +189,7 @@ class Estimator:
             return self.soc.cell_error(now, (voltage, current), sensor, cells)
 
         evidence = CellEvidence(error, road_power, self.soc.gate.rms)
-        reading = self._sources.read(now, dt, self.motion.speed, evidence)
+        reading = self.plausibility.pack.read(now, dt, self.motion.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
@@ -192,7 +201,7 @@ class Estimator:
 
     def _compare_grades(self, now: float, dt: float) -> None:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
-        grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
+        grades, speeds, reading = self.plausibility.grades, self.plausibility.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
         towed = self.forecaster.riding.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
@@ -200,13 +209,13 @@ class Estimator:
         grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._inputs.power_at(now, v, a))
         if grades.faulty != before:
             self.motion.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
-        left_out, self._distrusted = self._distrusted, self.redundancy.distrusted
+        left_out, self._distrusted = self._distrusted, self.plausibility.distrusted
         if self._distrusted == left_out:
             return
         newly = set(self._distrusted).difference(left_out)
-        learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
+        learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SPEEDS)
         if forgotten := newly & learned:
-            self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
+            self.forecaster.forget(max(UNLEARNED, self.plausibility.speeds.odometer.compared))
             self.explainer.forget(forgotten)
         if "auxiliary_current" in newly:
             self.forecaster.auxiliaries.forget()
@@ -235,7 +244,7 @@ class Estimator:
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
         speed, reading = self.motion.speed, self._reading
-        unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
+        unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.plausibility.speeds.disputed
         known = 0 < dt <= self._timing.pause and not unsure and self._activity.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
             still = 0.0 if dt <= self._timing.pause and self._activity.now is Activity.RIDING else dt
@@ -243,7 +252,7 @@ class Estimator:
             return
         power = reading.voltage * reading.current
         self.route.ride(dt, speed, power)
-        learned = self.forecaster.ride(
+        self.forecaster.ride(
             dt,
             speed,
             self.motion.grade,
@@ -253,8 +262,6 @@ class Estimator:
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
             self._drive(now, reading.voltage, power),
         )
-        if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
-            self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 
     def _drive(self, now: float, voltage: float, power: float) -> float:
         """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
@@ -310,9 +317,9 @@ class Estimator:
     def _reasons(self, now: float) -> Reason:
         s = self.signals
         reasons = self._missing.reasons(now, self._activity.takes_charge or s.carried)
-        if self._sources.currents_differ:
+        if self.plausibility.pack.current_difference.contradicts:
             reasons |= Reason.CURRENT_MISMATCH
-        differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
+        differ = self.plausibility.pack.voltage_dispute or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
         if differ or self.soc.gate.mismatch:
             reasons |= Reason.VOLTAGE_MISMATCH
         if self._timing.sampled > SLOWEST:

@@ -131,6 +131,10 @@ class Signals:
         for role, value in values.items():
             self.self_reported[role].accepted = None if value is None else (value, -inf)
 
+    def mapped(self, roles: Iterable[str]) -> tuple[str, ...]:
+        """Those of `roles` that the vehicle has."""
+        return tuple(role for role in roles if self._all[role].stale_after)
+
     def __getitem__(self, role: str) -> Signal:
         return self._all[role]
 

@@ -19,7 +19,7 @@ from gz_onboard.estimator.initial import (
     SteadyVoltage,
     first_filter,
 )
-from gz_onboard.estimator.redundancy.sag import VoltageSag
+from gz_onboard.estimator.plausibility.electrical import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser

@@ -48,7 +48,6 @@ def test_a_tow_is_known_by_current_or_torque(seen):
 WITNESSES = {
     "motor": Group("Motor", ("motor_speed", "inverter_current"), 0.5),
     "wheel": Group("Wheel", ("wheel_speed_front", "motor_torque"), 0.5),
-    "odometer": Group("Odometer", ("odometer",), 0.5),
 }
 GPS = Group("GPS", ("gps_speed", "gps_altitude", "accel_x"), 0.5)
 
@@ -69,18 +68,16 @@ def test_a_scooter_in_a_van_is_parked(witness):
     own = WITNESSES[witness]
     e = EventEstimator([PACK, own, GPS], VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     riding = e.forecaster.riding
-    rest = (1234000.0,) if witness == "odometer" else (0.0, 0.0)
-    for event in stand(180, 0.0, 0.0, rest[: len(own.roles)]):
+    for event in stand(180, 0.0, 0.0, (0.0, 0.0)):
         e.handle(event)
     before = riding.usual, e.motion.distance
     seen = set()
-    for event in stand(1200, 180.0, 15.0, rest[: len(own.roles)]):
+    for event in stand(1200, 180.0, 15.0, (0.0, 0.0)):
         e.handle(event)
         seen.add((e.estimate(event[0]).activity, e.estimate(event[0]).distrusted))
     estimate = e.estimate(event[0])
     assert estimate.activity is Activity.PARKED
     assert not estimate.distrusted
     assert riding.usual == before[0]
-    if witness != "odometer":  # which shows it only after its longest step
-        assert seen == {(Activity.PARKED, ())}
-        assert e.motion.distance == before[1]
+    assert seen == {(Activity.PARKED, ())}
+    assert e.motion.distance == before[1]

@@ -7,7 +7,7 @@ from math import exp
 
 import pytest
 
-from gz_onboard.estimator.redundancy.checks import SETTLED, RateLimit
+from gz_onboard.estimator.plausibility.residual import CONFIG, RateLimit
 from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
 from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, flat_pack, follow, worst
@@ -96,18 +96,17 @@ def test_a_first_value_that_is_none_accuses_nobody():
     assert {role for _, row in rows for role in row.distrusted} == set()
 
 
-def test_an_anchor_that_has_held_stays():
+def test_a_jump_of_a_settled_signal_is_refused():
     limit = RateLimit()
-    assert all(limit.update(1.0, 20.0, 0.1, 2.0) for _ in range(round(SETTLED) + 1))
-    assert not any(limit.update(1.0, 60.0, 0.1, 2.0) for _ in range(200))
-    assert limit.update(1.0, 21.0, 0.1, 2.0)
+    assert all(limit.allows(1.0, 20.0, 0.1, 0.1, 2.0) for _ in range(round(CONFIG.settled_after_s) + 1))
+    assert not any(limit.allows(1.0, 60.0, 0.1, 0.1, 2.0) for _ in range(200))
+    assert limit.allows(1.0, 21.0, 0.1, 0.1, 2.0)
 
 
-def test_an_anchor_that_was_a_moment_ago_does_not():
+def test_a_jump_from_a_start_up_value_is_accepted():
     limit = RateLimit()
-    possible = [limit.update(1.0, value, 0.1, 2.0) for value in (0.0, 30.0, 30.0, 30.0, 30.0)]
-    assert possible == [True, False, False, True, True]
-    assert not limit.update(1.0, 0.0, 0.1, 2.0)
+    assert all(limit.allows(1.0, value, 0.1, 0.1, 2.0) for value in (0.0, *[30.0] * 40))
+    assert not limit.allows(1.0, 0.0, 0.1, 0.1, 2.0)
 
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])

@@ -11,10 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.estimator.redundancy.checks import MOVING
-from gz_onboard.estimator.redundancy.currents import APART_RELATIVE
-from gz_onboard.estimator.redundancy.motion import DRIVES
-from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST
+from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, UNRELATED, Seconds, rate, relation, too_little, unit_of
 from gz_onboard.physics.battery import Battery
@@ -63,7 +60,7 @@ def check_voltages(ride: Seconds, battery: Battery, current: Array | None) -> It
     """Each within what the cells can have, and both against each other; current: of the pack [A] (n,)."""
     series = battery.cells_series
     low = EMPTIEST * min(battery.cutoff_voltage, battery.ocv_value[0])
-    high = HIGHEST * battery.ocv_value[-1]
+    high = CONFIG.highest_voltage_ratio * battery.ocv_value[-1]
     full, empty = battery.ocv_value[-1], battery.cutoff_voltage
     inside: list[str] = []
     for role in ride.any_of("pack_voltage", "inverter_voltage"):
@@ -86,7 +83,7 @@ def check_voltages(ride: Seconds, battery: Battery, current: Array | None) -> It
         apart = ride["inverter_voltage"] - ride["pack_voltage"]
         known = np.isfinite(apart)
         off = float(np.median(apart[known])) / series if known.any() else 0.0
-        looks = right if abs(off) < APART else wrong
+        looks = right if abs(off) < CONFIG.voltage_sd_v else wrong
         yield looks("voltages against each other", (*inside,), f"the inverter's is {off:+.3f} V a cell off the pack's")
 
 
@@ -133,7 +130,7 @@ def check_sag(of: PackRide) -> Iterator[Finding]:
     check = "current against the voltage's drop"
     capacity = of.battery.pack_capacity(BENCH_TEMPERATURE)
     current, volts = np.diff(of.current), np.diff(of.voltage)
-    if np.nanstd(of.current) < DRIVES * capacity / 2 or np.nanstd(current) < DRIVES * capacity / 4:
+    if np.nanstd(of.current) < 2 * CONFIG.idle_rate * capacity or np.nanstd(current) < CONFIG.idle_rate * capacity:
         yield unknown(check, PACK, f"the current hardly changes ({np.nanstd(of.current):.2f} A)" + _tiny(of, capacity))
         return
     found = relation(current, volts)
@@ -188,7 +185,7 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
     if of.current is None:
         return
     check, power = BY_POWER, of.voltage * of.current
-    moving = np.isfinite(power) & np.isfinite(expected) & (np.abs(speed) > MOVING)
+    moving = np.isfinite(power) & np.isfinite(expected) & (np.abs(speed) > CONFIG.moving_m_s)
     found = relation(expected, power, moving)
     if found is None:
         yield unknown(check, PACK, too_little(speed, "power and speed"))
@@ -245,7 +242,7 @@ def check_currents(ride: Seconds) -> Iterator[Finding]:
     text = f"the inverter's is {found.factor:.3g} times the pack's"
     if found.correlation < 0:
         yield wrong(check, roles, f"{text}: the sign of one")
-    elif abs(found.factor - 1) < 2 * APART_RELATIVE:
+    elif abs(found.factor - 1) < 2 * CONFIG.current_sd_relative:
         yield right(check, roles, text)
     else:
         yield wrong(check, roles, text + _either(found.factor))

@@ -8,10 +8,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import EARTH_RADIUS, GRAVITY
-from gz_onboard.estimator.redundancy.checks import MOVING
-from gz_onboard.estimator.redundancy.odometer import APART as ODOMETER_APART
-from gz_onboard.estimator.redundancy.odometer import FASTEST
-from gz_onboard.estimator.redundancy.speeds import AXLE, GROUND, SPEED_APART, SPEED_APART_RELATIVE, vote
+from gz_onboard.estimator.plausibility.residual import CONFIG
+from gz_onboard.estimator.plausibility.speeds import AXLE, GROUND, vote
 from gz_onboard.events import SPEEDS
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relation, too_little, unit_of
@@ -50,12 +48,14 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     check = "speeds against each other"
     for role, speed in speeds.items():
         top = float(np.nanmax(np.abs(speed)))
-        if top > FASTEST:
+        if top > CONFIG.fastest_m_s:
             yield wrong("speed", (role,), f"reaches {3.6 * top:.0f} km/h by the radius and gear ratio of the file")
-        if float(np.nanmean(speed)) < -SPEED_APART:
+        if float(np.nanmean(speed)) < -CONFIG.speed_sd_m_s:
             yield wrong(SIGN, (role,), "is negative while riding: give scale = -1")
     known = np.all(np.isfinite(list(speeds.values())), axis=0) if speeds else np.zeros(0, dtype=bool)
-    moving = known & (np.max(np.abs(list(speeds.values())), axis=0, initial=0.0) > MOVING) if speeds else known
+    moving = (
+        known & (np.max(np.abs(list(speeds.values())), axis=0, initial=0.0) > CONFIG.moving_m_s) if speeds else known
+    )
     roles = tuple(speeds)
     if moving.sum() < FEWEST:
         if roles:
@@ -69,7 +69,7 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     if _on_bench(means):
         yield unknown(check, roles, f"the driven axle turns and the ground stands: {BENCH}")
         return
-    apart = {role: SPEED_APART / 2 + SPEED_APART_RELATIVE * mean for role, mean in means.items()}
+    apart = {role: CONFIG.speed_sd_m_s / 2 + CONFIG.speed_sd_relative * mean for role, mean in means.items()}
     outvoted, tied = vote(means, apart, spins=False)
     yield from _speed_verdicts(check, means, outvoted, tied)
 
@@ -77,7 +77,7 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
 def _on_bench(means: dict[str, float]) -> bool:
     """Whether the driven axle turns and all else stands; means: of each speed [m/s]."""
     ground = [role for role in means if role in GROUND]
-    stands = all(means[role] < SPEED_APART for role in ground) and bool(AXLE & means.keys())
+    stands = all(means[role] < CONFIG.speed_sd_m_s for role in ground) and bool(AXLE & means.keys())
     return stands and (len(ground) > 1 or not means.keys() - AXLE - set(ground))
 
 
@@ -176,7 +176,7 @@ def _odometer(odometer: Array, best: str, speed: Array, radius: float | None) ->
     ratio = ridden / counted
     text = f"{best} goes {ridden / 1e3:.2f} km, the odometer {counted / 1e3:.2f} km"
     off = abs(ridden - counted)
-    if off <= max(ODOMETER_APART * max(ridden, counted), 2 * largest):
+    if off <= max(CONFIG.odometer_sd * max(ridden, counted), 2 * largest):
         if radius is None or off <= max(ODOMETER_ERRS * max(ridden, counted), 2 * largest):
             yield right(check, roles, text)
             return
@@ -200,7 +200,7 @@ def _poles(latitude: Array, longitude: Array) -> Iterator[Finding]:
 def _where(ride: Seconds, speed: Array) -> tuple[Array, Mask]:
     """(the way [m] (n - 1,) by `speed` (n,) from each position to the next, 0 where it does not move; where it does)"""
     known = np.isfinite(ride["latitude"]) & np.isfinite(ride["longitude"]) & np.isfinite(speed)
-    moving = known & (speed > MOVING)
+    moving = known & (speed > CONFIG.moving_m_s)
     return np.where(moving[:-1] & moving[1:], (speed[:-1] + speed[1:]) / 2, 0.0) * SECOND, moving
 
 
@@ -230,9 +230,9 @@ def _positions(ride: Seconds, best: str, speed: Array) -> Iterator[Finding]:
     if off > UNLIKE and turned_off < off / 2:
         said = f"in stretches of {STRETCH} s they are {off:.0%} off {best}, and exchanged {turned_off:.0%}"
         yield wrong("positions", ("latitude", "longitude"), f"swapped: {said}")
-    elif abs(way / ridden - 1) < ODOMETER_APART:
+    elif abs(way / ridden - 1) < CONFIG.odometer_sd:
         yield right(check, roles, text)
-    elif abs(turned / ridden - 1) < ODOMETER_APART and turned_off < off + UNLIKE / 2:
+    elif abs(turned / ridden - 1) < CONFIG.odometer_sd and turned_off < off + UNLIKE / 2:
         yield wrong("positions", ("latitude", "longitude"), f"swapped: {text}, and exchanged {turned / 1e3:.2f} km")
     elif way < SHORTEST / 10:
         yield wrong("positions", ("latitude", "longitude"), f"stuck: {text}")
@@ -292,7 +292,7 @@ def check_turning(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     if not {"rate_z", "gps_course"} <= ride.columns.keys() or not speeds:
         return
     check, roles = "turning against course", ("rate_z", "gps_course")
-    fast = np.abs(next(iter(speeds.values()))) > 2 * MOVING
+    fast = np.abs(next(iter(speeds.values()))) > 2 * CONFIG.moving_m_s
     turning = -rate(ride["gps_course"])
     turning = np.where(np.abs(turning) < 1.0, turning, np.nan)
     found = relation(turning, ride["rate_z"], fast)

@@ -9,13 +9,14 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.units import to_si
 from gz_onboard.constants import KELVIN
-from gz_onboard.estimator.redundancy.checks import MOVING
-from gz_onboard.estimator.redundancy.temperatures import COLDER, TEMPERATURES
+from gz_onboard.estimator.plausibility.residual import CONFIG
+from gz_onboard.estimator.plausibility.temperatures import LIMITS
 from gz_onboard.events import words
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, rate, relation
 
 NEAR, FAR = 15.0, 25.0  # K between cells and air: usual; more than from a warm room, or a charge, into the cold
+COLDER = 45.0  # K: cells were never so much colder than the air
 WARMS = ((12.0, 2.0), (5.0, 4.0))
 """K and a factor: cells or air that change by more on a ride, and by as many times what the motor does, are its."""
 FAHRENHEIT = 8.0  # K: so near the air are cells that were read in °F
@@ -30,8 +31,8 @@ STANDS |= {"accel_x", "accel_y", "accel_z", "rate_x", "rate_y", "rate_z"}
 
 def check_temperatures(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
     """Each within what vehicles have; the cells' against the air's."""
-    for role in ride.any_of(*TEMPERATURES):
-        low, high = TEMPERATURES[role][:2]
+    for role in ride.any_of(*LIMITS):
+        low, high = LIMITS[role][:2]
         least, most = float(np.nanmin(ride[role])), float(np.nanmax(ride[role]))
         middle = 0.5 * (least + most)
         if low < least and most < high:
@@ -41,7 +42,7 @@ def check_temperatures(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
         kelvin = ": that is K taken for °C" if low < middle - KELVIN < high else ""
         yield wrong("temperature", (role,), f"{least:.0f} to {most:.0f} °C, possible are {low:g} to {high:g}{kelvin}")
     if speed is not None:
-        yield from _swapped(ride, np.abs(speed) > MOVING)
+        yield from _swapped(ride, np.abs(speed) > CONFIG.moving_m_s)
     if {"cell_temperature", "ambient_temperature"} <= ride.columns.keys():
         yield from _cells_and_air(ride["cell_temperature"], ride["ambient_temperature"])
     elif "cell_temperature" in ride or "ambient_temperature" in ride:
@@ -92,7 +93,7 @@ def check_switches(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
     """Those whose state the motion shows."""
     if speed is None:
         return
-    moving = np.abs(speed) > MOVING
+    moving = np.abs(speed) > CONFIG.moving_m_s
     if moving.sum() < FEWEST:
         return
     for role, riding in (("charge_plug", 0.0), ("key", 1.0), ("contactor", 1.0)):
@@ -145,9 +146,9 @@ def check_throttle(ride: Seconds, current: Array | None) -> Iterator[Finding]:
 
 def check_stuck(ride: Seconds, speed: Array | None, bench: bool = False) -> Iterator[Finding]:
     """One value for the whole ride, where it must move; bench: only the driven axle does."""
-    if speed is None or float(np.nansum(np.abs(speed) > MOVING)) < FEWEST:
+    if speed is None or float(np.nansum(np.abs(speed) > CONFIG.moving_m_s)) < FEWEST:
         return
-    moving = np.abs(speed) > MOVING
+    moving = np.abs(speed) > CONFIG.moving_m_s
     for role, values in ride.columns.items():
         of = values[moving & np.isfinite(values)]
         if role in STEADY or role.startswith(("pack_temperature", "roller", "suspension", "brake", "bms_temp")):

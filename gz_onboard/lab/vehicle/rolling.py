@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.estimator.redundancy.checks import MOVING
+from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.vehicle.finding import Finding, Looks, wrong
 from gz_onboard.lab.vehicle.motion import way_over_odometer, way_over_positions
 from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, unit_of
@@ -86,7 +86,7 @@ def _factor(speed: Array | None, other: Array | None) -> float | None:
     if speed is None or other is None:
         return None
     a, b = np.abs(speed), np.abs(other)
-    moving = (a > MOVING) & (b > MOVING)
+    moving = (a > CONFIG.moving_m_s) & (b > CONFIG.moving_m_s)
     if moving.sum() < FEWEST:
         return None
     ratios = a[moving] / b[moving]

@@ -10,7 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.units import UNITS, known_units, to_si
-from gz_onboard.estimator.redundancy.checks import MOVING
+from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.discover.grid import averaged, measured
 from gz_onboard.lab.discover.stand_ins import delays
 from gz_onboard.offline.samples import Samples
@@ -93,7 +93,7 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
 
 def too_little(speed: Array, what: str) -> str:
     """Say why `what` cannot be compared: too little motion at this `speed` (n,) [m/s], or they are not there."""
-    moving = int(np.sum(np.abs(speed) > MOVING))
+    moving = int(np.sum(np.abs(speed) > CONFIG.moving_m_s))
     if moving < FEWEST:
         return f"the vehicle moves for {moving} s in this log, and {FEWEST} s are needed"
     return f"{what} are too seldom there together, or do not change"
