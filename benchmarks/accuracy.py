@@ -20,9 +20,9 @@ from math import sqrt
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 
 

@@ -87,7 +87,7 @@ def has_can() -> bool:
 
 def recorded(seconds: float) -> Send:
     """The beginning of a recorded ride in its own timing."""
-    from gz_onboard.bus.logs import read_frames
+    from gz_onboard.recording.logs import read_frames
 
     frames: list[tuple[float, bytes]] = []
     start = None
@@ -284,10 +284,10 @@ def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
 
     The daemon's own pipeline and recorder, called as its loop calls them, at the ride's times.
     """
-    from gz_onboard.bus.logs import read_frames
     from gz_onboard.bus.recorder import Recorder
     from gz_onboard.daemon.loop import TICK
     from gz_onboard.pipeline import Pipeline, dbc_texts
+    from gz_onboard.recording.logs import read_frames
     from gz_onboard.vehicle import read_vehicle
 
     vehicle = read_vehicle("reference")

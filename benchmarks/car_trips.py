@@ -88,7 +88,7 @@ def judged_at(car: Car) -> int:
 
 def judge(file: Path, vehicle_file: Path) -> Trip:
     car, vehicle = read_car(file), read_vehicle(vehicle_file)
-    mapping, batches = open_ride(file, vehicle)
+    mapping, frames = open_ride(file, vehicle)
     row = judged_at(car)
     seen: list[Estimate] = []
     errors: list[tuple[float, float, float]] = []  # of the cells' state of charge and of that shown; time
@@ -106,7 +106,7 @@ def judge(file: Path, vehicle_file: Path) -> Trip:
             seen.append(e)
 
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
-    feed(pipeline, batches)
+    feed(pipeline, frames)
     e, sums = seen[0], pipeline.estimator.forecaster.learner.state.sums
     assert e.range and e.range_p10 and e.range_p90 and e.consumption_expected and e.energy_left
     way, energy, charge = (values[-1] - values[row] for values in (car.distance, car.energy, car.soc))

@@ -34,10 +34,10 @@ from benchmarks.range_rides import Drawn, Truth, again, draw, ride_until_empty, 
 from benchmarks.range_week import NIGHT, RIDES, Ride, ride_weeks
 from benchmarks.range_yardstick import BUT_FOR_HEIGHT, NAMES, OURS, Usual, crps, jumps
 from benchmarks.trial import commit
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import progress_bar
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import read_vehicle
 

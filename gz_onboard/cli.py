@@ -32,7 +32,7 @@ COMMANDS = {
     "dashboard": ("gz_onboard.dashboard.command", "show the daemon's range in a terminal or a browser"),
     "mqtt": ("gz_onboard.bridges.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
     "foxglove": ("gz_onboard.bridges.foxglove", "show the daemon's range live in Foxglove"),
-    "replay": ("gz_onboard.bus.replay", "send a recorded log onto a bus, in its own timing"),
+    "replay": ("gz_onboard.recording.replay", "send a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
     "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
     "validate": (

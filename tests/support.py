@@ -13,13 +13,14 @@ from cantools.database.can import Database, Message
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.export import write_frames_as
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.physics.effect import Port
 from gz_onboard.pipeline import TICK_NS, Pipeline
+from gz_onboard.recording.export import write_frames_as
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -226,10 +227,10 @@ class Run:
         return self.pipeline.codec.faults
 
 
-def ridden(frames: Sequence[Frame], vehicle: Vehicle | None = None, portion: int = 500) -> Run:
+def ridden(frames: Sequence[Frame], vehicle: Vehicle | None = None) -> Run:
     """The frames through a new pipeline as an offline estimate does it."""
     run = Run(vehicle)
-    feed(run.pipeline, [frames[i : i + portion] for i in range(0, len(frames), portion)])
+    feed(run.pipeline, FrameColumns.of(frames))
     return run
 
 

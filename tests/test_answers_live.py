@@ -11,10 +11,10 @@ import pytest
 
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
+from gz_onboard.recording.logs import read_frames
 from tests.polled import STEADY, carried, kona, payload, request
 
 

@@ -18,7 +18,7 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import api, cli, state
-from gz_onboard.bus.logs import read_frames
+from gz_onboard.recording.logs import read_frames
 from tests.support import LOGS, ROOT, write_log
 from tests.test_learned import CAPACITY, saved
 

@@ -31,7 +31,6 @@ from hypothesis import strategies as st
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.library_bus import LibraryBus
-from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary
@@ -40,6 +39,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, WINDOW, Frame, Reason, State
 from gz_onboard.pipeline import TICK_NS
+from gz_onboard.recording.logs import read_frames, read_samples
 from tests.support import S, Scooter, check_frames, reference, ridden
 
 _NUMBERS = count()

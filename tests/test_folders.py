@@ -14,9 +14,9 @@ from threading import Thread
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.bus.logs import ESTIMATED, logs_among, read_frames
-from tests.bus.test_replay import Listener
+from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
 from tests.lab.short_logs import short_log
+from tests.recording.test_replay import Listener
 from tests.support import LOGS, ROOT
 
 RIDE = str(LOGS / "coastdown.blf")

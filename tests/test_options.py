@@ -6,11 +6,11 @@ import argparse
 
 import pytest
 
-from gz_onboard.bus import logs
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
 from gz_onboard.options import LOG_SUFFIXES, add_shared, number
 from gz_onboard.pipeline import filter_maker
+from gz_onboard.recording import logs
 from tests.support import ROOT
 
 

@@ -177,7 +177,7 @@ RIDE = """
 import os, signal, socket, sys, threading, time
 from pathlib import Path
 from gz_onboard import cli
-from gz_onboard.bus.logs import read_samples
+from gz_onboard.recording.logs import read_samples
 
 log, folder = sys.argv[1:]
 bus = ["--interface", "virtual", "--channel", "board"]

@@ -24,6 +24,7 @@ LAYERS = [
     ["estimator"],
     ["log_rows"],
     ["pipeline"],
+    ["recording"],
     ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
@@ -41,9 +42,10 @@ FORBIDDEN = {
     ("daemon", "lab"): "the daemon carries no offline tools",
     ("daemon", "simulation"): "the daemon carries no offline tools",
     ("daemon", "offline"): "the daemon carries no offline tools",
+    ("daemon", "recording"): "the daemon carries no offline tools",
 }
 
-OFFLINE = ("offline", "simulation", "lab", "api")
+OFFLINE = ("recording", "offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
 # Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
 ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py", "bridges/broker.py"}

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
-from gz_onboard.bus import tables
-from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError, brief
 from gz_onboard.events import Frame
 from gz_onboard.lab import export_tables
 from gz_onboard.offline.arguments import checked, within
-from gz_onboard.offline.table import Columns, Tabular
+from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.options import LONGEST_LOG
+from gz_onboard.recording import tables
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.readers.contents import LogDamage
 
-_KINDS = {"channel": np.int64, "identifier": np.int64, "data": object}  # the others are truth values
+_KINDS = {int: np.int64, bool: bool, str: object}
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class LoggedFrames(Tabular):
 
     def to_table(self) -> Columns:
         """A row for each frame, with the columns that ``gz-onboard export --frames`` writes."""
-        columns = tables.frame_columns(self.frames)
-        arrays = {name: np.array(column, dtype=_KINDS.get(name, bool)) for name, column in columns.items()}
+        columns = tables.frame_columns(FrameColumns.of(self.frames))
+        arrays = {name: np.array(column, _KINDS[tables.FRAME[name]]) for name, column in columns.items()}
         return {"time": _times([frame[0] for frame in self.frames]), **arrays}
 
 
@@ -85,8 +86,8 @@ class LoggedSignals(Tabular):
 def read_frames(log: PathLike, *, start: float = 0.0, end: float | None = None) -> LoggedFrames:
     """The frames in a log. start, end: only those in this part of it [s from its beginning]. Raises InputError."""
     source = _source(log, start, end)
-    _, batches = source.frames()
-    return LoggedFrames([frame for batch in batches for frame in batch], source.damages)
+    _, frames = source.frames()
+    return LoggedFrames(frames.tuples(), source.damages)
 
 
 @checked
@@ -109,9 +110,10 @@ def read_signals(
     source = _source(log, start, end, columns)
     known = None if vehicle is None else vehicle_of(vehicle)
     found = export_tables.signals_of(source, [Path(file) for file in dbc], known)
-    kept = export_tables.KeptSignals()
-    tables.write_signals(found.decoded, kept)
-    messages = {name: LoggedMessage(*of) for name, of in kept.messages().items()}
+    messages = {
+        name: LoggedMessage(rows.times, {column: array_of(values) for column, values in rows.columns.items()})
+        for name, rows in tables.by_message(found.decoded).items()
+    }
     if (decoder := found.decoder) is None:
         return LoggedSignals(messages, source.damages)
     conflicts = tuple(decoder.origins.conflicts.values())

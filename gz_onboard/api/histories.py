@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError, brief
 from gz_onboard.lab.history.add import AddedRides, HistoryTask, LogRides, keep, new_tasks, rides_in
 from gz_onboard.lab.history.choice import Choice, default_file, period, read_rides
@@ -19,6 +18,7 @@ from gz_onboard.lab.history.text import overview_text
 from gz_onboard.lab.history.totals import Overview, overviews
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, array_of
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.vehicle import Vehicle
 
 

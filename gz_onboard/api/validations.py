@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError
 from gz_onboard.lab.validate import pool, ride_text
 from gz_onboard.lab.validate_report import markdown
@@ -17,6 +16,7 @@ from gz_onboard.lab.validate_score import ValidatedRide
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.simulation.plan import vehicle_on
 from gz_onboard.vehicle import Vehicle
 

@@ -9,9 +9,7 @@ to the nanosecond and the order of the frames is kept.
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from itertools import accumulate, repeat
+from collections.abc import Sequence
 from math import gcd
 from operator import sub
 
@@ -81,55 +79,3 @@ def encode_block(frames: Sequence[Frame]) -> bytes:
         joined = b"".join(of_kind)
         parts += [joined[i::length] for i in range(length)]
     return b"".join(parts)
-
-
-def decode_block(block: bytes) -> list[Frame]:
-    """The frames of one block, in the order in which they were given to `encode_block`.
-
-    Raises ValueError for anything that is not a whole block.
-    """
-    try:
-        version, width, kinds, count, first, unit = _HEAD.unpack_from(block)
-    except struct.error:
-        raise ValueError(f"a block of {len(block)} bytes is too short") from None
-    if version != _VERSION or width not in _WIDTHS or not kinds or not count:
-        raise ValueError(f"not a block of frames of version {_VERSION}")
-    order_type, order_width = ("B", 1) if kinds <= 256 else ("H", 2)
-    order_at = _HEAD.size + kinds * _KIND.size
-    steps_at = order_at + count * order_width
-    data_at = steps_at + (count - 1) * width
-    if len(block) < data_at:
-        raise ValueError(f"a block of {count} frames is cut off")
-    table = list(_KIND.iter_unpack(block[_HEAD.size : order_at]))
-    order = struct.unpack_from(f"<{count}{order_type}", block, order_at)
-    if max(order) >= kinds:
-        raise ValueError("a frame of a kind that the block does not have")
-    steps = struct.unpack(f"<{count - 1}{_WIDTHS[width]}", _rows(block, steps_at, count - 1, width))
-    times = accumulate((step * unit for step in steps), initial=first)
-    datas = _datas(block, data_at, order, [length for _, _, length in table])
-    return [(time, table[kind][0], data, table[kind][1]) for time, kind, data in zip(times, order, datas, strict=True)]
-
-
-def _rows(block: bytes, at: int, count: int, width: int) -> bytearray:
-    """`count` rows of `width` bytes that stand at `at` as byte planes."""
-    rows = bytearray(count * width)
-    for i in range(width):
-        rows[i::width] = block[at + i * count : at + (i + 1) * count]
-    return rows
-
-
-def _datas(block: bytes, position: int, order: Sequence[int], lengths: Sequence[int]) -> list[bytes]:
-    """The data of the frames in their order. `order`: the kind of each; `lengths`: of the data, by kind."""
-    of_kind: list[Iterator[tuple[bytes]]] = []
-    numbers = Counter(order)
-    for kind, length in enumerate(lengths):
-        number = numbers[kind]
-        end = position + number * length
-        if end > len(block):
-            raise ValueError(f"a block of {len(order)} frames is cut off")
-        rows = _rows(block, position, number, length)
-        of_kind.append(struct.iter_unpack(f"{length}s", rows) if length else repeat((b"",)))
-        position = end
-    if position != len(block):
-        raise ValueError(f"{len(block) - position} bytes too many after a block of {len(order)} frames")
-    return [next(of_kind[kind])[0] for kind in order]

@@ -422,13 +422,6 @@ class ConsumptionLearner:
         return min(max(1 - self.habits.price.variance / self.prior.price.variance, 0.0), 1.0)
 
     @property
-    def recent_factor(self) -> float:
-        """Measured over modelled energy of about the last kilometre; 1 while that is not known."""
-        recent = self.state.recent
-        known = self.state.sums.distance >= CONSUMPTION.recent_m and recent.modelled > 0
-        return recent.measured / recent.modelled if known else 1.0
-
-    @property
     def recent_consumption(self) -> float | None:
         """Consumption over about the last kilometre, stops included [J/m]; None: too short a way."""
         recent, now = self.state.recent, self._segment

@@ -14,7 +14,6 @@ from itertools import chain
 from pathlib import Path
 
 from gz_onboard import state
-from gz_onboard.bus.logs import is_table
 from gz_onboard.constants import HOUR
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
@@ -31,6 +30,7 @@ from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import Display, Progress, progress_bar
+from gz_onboard.recording.logs import is_table
 from gz_onboard.vehicle import find_vehicle
 
 LEAST_MISSING = 1.0  # s: less is not told

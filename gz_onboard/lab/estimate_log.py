@@ -10,7 +10,6 @@ from pathlib import Path
 
 from gz_onboard import __version__, state
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.logs import ESTIMATED, read_metadata
 from gz_onboard.bus.recorder import is_complete
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through, vehicle_of
@@ -22,6 +21,7 @@ from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import of_ride
 from gz_onboard.pipeline import dbc_texts, lacking
 from gz_onboard.progress import Progress
+from gz_onboard.recording.logs import ESTIMATED, read_metadata
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 

@@ -18,6 +18,7 @@ from gz_onboard.offline.results import FIRST_DATE_NS
 from gz_onboard.offline.samples import facts_of
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.progress import Progress
+from gz_onboard.recording.timeline import on_timeline
 from gz_onboard.vehicle import Vehicle
 
 Unread: TypeAlias = tuple[EstimateTask, InputError]
@@ -37,10 +38,9 @@ def span_of(source: Path | SignalTable, vehicle: Vehicle, progress: Progress | N
     """When the ride in a log or a table was, by its clock as it is set at the end. InputError if that has no date."""
     ride = open_estimate(source, vehicle)
     codec = Codec(replace(ride.vehicle.mapping, sources=(), requests=()), LONGEST_PAUSE_NS)
-    for batch in ride.batches:
-        codec.decode(batch)
-        if progress:
-            progress(len(batch))
+    on_timeline(ride.frames.time_ns, codec)
+    if progress:
+        progress(len(ride.frames))
     return Span(codec.time_ns(0.0), codec.last_ns, ride.vehicle.name)
 
 

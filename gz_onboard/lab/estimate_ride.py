@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS, Codec
-from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
-from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame
@@ -24,6 +23,10 @@ from gz_onboard.offline.samples import check_ridden, of_ride, open_ride
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
+from gz_onboard.recording.decode import decode_columns
+from gz_onboard.recording.frames import BATCH, FrameColumns
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.timeline import stray
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -42,14 +45,18 @@ class _Mute(Publisher):
         return []
 
 
-def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progress | None = None) -> None:
-    """All frames of a log through `pipeline`, in any portions; `progress` is called with their numbers.
+def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = None) -> None:
+    """Take all frames of a log through `pipeline`; `progress` is called with the numbers of frames taken.
 
     Gaps are ridden through as a live bus would have it, up to a minute; a longer one is a pause of the recording.
     """
     now: int | None = None
-    for batch, count in without_lone(batches, pipeline.codec.odd):
-        for portion in _without_jumps(batch):
+    odd = stray(frames.time_ns)
+    for start in range(0, len(frames), BATCH):
+        batch, left_out = frames[start : start + BATCH], odd[start : start + BATCH]
+        if left_out.any():
+            pipeline.codec.odd(batch[left_out].tuples())
+        for portion in _without_jumps(batch[~left_out].tuples()):
             first, last = portion[0][0], portion[-1][0]
             if now is None:
                 now = first
@@ -59,10 +66,13 @@ def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progr
             if _GAP_NS < first - now <= _PAUSE_NS:
                 for step in range(now + _GAP_NS, first, _GAP_NS):
                     pipeline.advance((), step)
-            pipeline.advance(portion, last)
+            begun = CONFIRM if first - now > _PAUSE_NS else 0
+            if begun:  # the ride goes on where the new time is believed, not at the end of the portion
+                pipeline.advance(portion[:begun], portion[:begun][-1][0])
+            pipeline.advance(portion[begun:], last)
             now = last
         if progress:
-            progress(count)
+            progress(len(batch))
 
 
 def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
@@ -83,13 +93,13 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
 
 @dataclass(frozen=True)
 class OpenRide:
-    """A ride that is to be estimated. batches: its frames, without an earlier run's estimates."""
+    """A ride before its estimation. frames: without the range frames of an earlier run."""
 
     source: Path  # its log, or what its table is called
     vehicle: Vehicle  # with the mapping of the ride
     start_ns: int
-    batches: Iterable[list[Frame]]
-    damages: list[LogDamage]  # complete once the frames were read
+    frames: FrameColumns
+    damages: list[LogDamage]
 
 
 @dataclass(frozen=True)
@@ -124,29 +134,32 @@ def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
     """The ride of `vehicle` in a log or a table of signals; InputError if there is none."""
     damages: list[LogDamage] = []
     name = source.name if isinstance(source, SignalTable) else source
-    mapping, batches = open_ride(source, vehicle, damages.append)
+    mapping, frames = open_ride(source, vehicle, damages.append)
     vehicle = replace(of_ride(vehicle, source), mapping=mapping)
-    vehicle, batches = _identified(vehicle, batches, str(name))
-    own = range_publisher(vehicle).may_have_sent
-    ours = ([frame for frame in batch if not own(frame)] for batch in batches)
-    first = next((batch for batch in ours if batch), None)
-    if first is None:
+    vehicle = _identified(vehicle, frames, str(name))
+    frames = _without_own(frames, range_publisher(vehicle))
+    if not len(frames):
         raise InputError(f"{name}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
-    return OpenRide(name, vehicle, first[0][0], chain([first], ours), damages)
+    return OpenRide(name, vehicle, int(frames.time_ns[0]), frames, damages)
 
 
-def _identified(vehicle: Vehicle, batches: Iterator[list[Frame]], where: str) -> tuple[Vehicle, Iterator[list[Frame]]]:
-    """The vehicle whose number the frames show in the first minute, if they show one, and all of the frames."""
+def _without_own(frames: FrameColumns, publisher: Publisher) -> FrameColumns:
+    """Leave out the frames that an earlier run of the publisher may have sent."""
+    alike = np.flatnonzero(np.isin(frames.identifier, list(publisher.identifiers)))
+    own = [publisher.may_have_sent(frame) for frame in frames[alike].tuples()]
+    return frames[np.delete(np.arange(len(frames)), alike[own])] if any(own) else frames
+
+
+def _identified(vehicle: Vehicle, frames: FrameColumns, where: str) -> Vehicle:
+    """The vehicle whose number the frames show in the first minute, if they show one."""
     sources = tuple(source for source in vehicle.mapping.instruments if source.role == "vehicle_id")
+    if not sources:
+        return vehicle
     codec = Codec(replace(vehicle.mapping, sources=sources, requests=()), LONGEST_PAUSE_NS)
-    read: list[list[Frame]] = []
-    while sources and codec.seconds(codec.last_ns) < IDENTIFIED_WITHIN and (batch := next(batches, None)):
-        read.append(batch)
-        codec.decode(batch)
-        for window in codec.windows():
-            if number := window.roles[0]:
-                vehicle, sources = vehicle.identified(f"{number.value:.0f}", where), ()
-    return vehicle, chain(read, batches)
+    times, numbers = decode_columns(frames, codec).get("vehicle_id", (np.zeros(0), np.zeros(0)))
+    if not (times[:1] <= IDENTIFIED_WITHIN).any():
+        return vehicle
+    return vehicle.identified(f"{numbers[0]:.0f}", where)
 
 
 def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None = None) -> Ridden:
@@ -180,7 +193,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         pipeline.estimator.route.follow(pipeline.estimator.route.prepare(how.route))
     if not how.frames:
         pipeline.publisher = _Mute()
-    feed(pipeline, ride.batches, progress)
+    feed(pipeline, ride.frames, progress)
     check_ridden(ride.source, ride.vehicle, pipeline.codec)
     if tally.last:  # what came after the last whole second counts too
         log.sample(STATUS_TOPIC, pipeline.codec.time_ns(tally.last.time), pipeline.status())

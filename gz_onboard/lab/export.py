@@ -22,9 +22,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gz_onboard.bus import logs
-from gz_onboard.bus.export import out_suffix, whole, write_frames_as, write_mcap
-from gz_onboard.bus.tables import write_frame_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.lab.export_contents import contents_text, log_contents
 from gz_onboard.lab.export_tables import (
@@ -38,6 +35,9 @@ from gz_onboard.lab.export_tables import (
     write_signals,
 )
 from gz_onboard.options import add_shared
+from gz_onboard.recording import logs
+from gz_onboard.recording.export import out_suffix, whole, write_frames_as, write_mcap
+from gz_onboard.recording.tables import FRAME, frame_columns, write_table
 from gz_onboard.vehicle import read_vehicle
 
 _TABLES = (".csv", ".parquet", ".jsonl")
@@ -162,22 +162,24 @@ def _estimates(arguments: argparse.Namespace, source: ExportSource, part: Path, 
 def _frames(source: ExportSource, part: Path, suffix: str) -> str:
     if source.columns is not None:
         raise InputError("--columns: applies to estimates or signals, with --estimates or --signals")
-    _, batches = source.frames()
-    if suffix in (".parquet", ".jsonl"):
-        return f"{write_frame_table(part, batches)} frames"
+    _, frames = source.frames()
     if suffix in ("", ".mcap"):
         raise InputError("--frames: can be written to .log .blf .asc .trc .csv .mf4 .parquet .jsonl")
-    return f"{write_frames_as(part, suffix, batches)} frames"
+    if suffix in (".parquet", ".jsonl"):
+        write_table(part, frame_columns(frames), frames.time_ns.tolist(), FRAME)
+    else:
+        write_frames_as(part, suffix, frames.batches())
+    return f"{len(frames)} frames"
 
 
 def _signals(arguments: argparse.Namespace, source: ExportSource, part: Path, kind: str) -> str:
     vehicle = read_vehicle(arguments.vehicle) if arguments.vehicle else None
     if kind == ".mcap" and holds_frames(source.log):
-        section, batches = source.frames()
+        section, frames = source.frames()
         decoder = decoder_of(source.log, arguments.dbc, vehicle)
         if source.columns is not None:
             raise InputError("--columns: an .mcap has all that is in the log")
-        text = f"{write_mcap(source.log, part, decoder, batches, section)} samples"
+        text = f"{write_mcap(source.log, part, decoder, frames.batches(), section)} samples"
     else:
         found = signals_of(source, arguments.dbc, vehicle)
         count = write_signals(source, part, kind, found)

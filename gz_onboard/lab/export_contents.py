@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import accumulate
 from pathlib import Path
 
-from gz_onboard.bus import logs
+import numpy as np
+
 from gz_onboard.bus.codec import BACK_NS
 from gz_onboard.lab.export_tables import recorded_messages
 from gz_onboard.offline.results import clock, text_rows
+from gz_onboard.recording import logs
+from gz_onboard.recording.readers.contents import LogDamage
 
 
 @dataclass(frozen=True)
@@ -33,22 +35,18 @@ class Contents:
 
 def log_contents(log: Path) -> Contents:
     """What `log` holds, by reading it whole; InputError if it cannot be read."""
-    damages: list[logs.LogDamage] = []
-    count = back = 0
-    times: list[int] = []  # the least and the greatest
-    for batch in logs.read_frames(log, on_damage=damages.append):
-        stamps = [frame[0] for frame in batch]
-        latest = accumulate(stamps, max, initial=times[-1] if times else 0)
-        back += sum(time_ns < before - BACK_NS for time_ns, before in zip(stamps, latest, strict=False))
-        count += len(batch)
-        times = [min(stamps + times), max(stamps + times)]
+    damages: list[LogDamage] = []
+    frames = logs.read_log(log, on_damage=damages.append)
+    stamps = frames.time_ns
+    back = int((stamps < np.maximum.accumulate(stamps) - BACK_NS).sum())
+    times = [int(stamps.min()), int(stamps.max())] if len(frames) else []
     topics: Counter[str] = Counter()
     for topic, time_ns, _ in logs.read_samples(log):
         topics[topic] += 1
         times = [min([time_ns, *times]), max([time_ns, *times])]
     metadata, attached = logs.read_metadata(log), sorted(logs.read_attachments(log))
     first, last = times or (None, None)
-    return Contents(log, metadata, attached, count, back, first, last, dict(topics), list(map(str, damages)))
+    return Contents(log, metadata, attached, len(frames), back, first, last, dict(topics), list(map(str, damages)))
 
 
 def contents_text(found: Contents) -> str:

@@ -4,34 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gz_onboard.bus import logs, tables
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.bus.replay import log_section
-from gz_onboard.bus.signals import Decoded, Decoder, Values
+from gz_onboard.bus.signals import Decoded, Decoder
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import Frame
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC, table_columns
-from gz_onboard.offline.table import Columns, array_of
+from gz_onboard.recording import logs, tables
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.replay import log_section
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 ESTIMATES = {"estimate": ESTIMATE_TOPIC, "why": WHY_TOPIC, "range_change": CHANGE_TOPIC}
 """The topics that a folder of tables has beside the messages, by the name of the table."""
-_FOLDERS: dict[str, Callable[[Path, Mapping[str, Mapping[str, str]], ExitStack], tables.Sink]] = {
-    "/.parquet": tables.ParquetTables,
-    "/.csv": tables.CsvTables,
-    "/.jsonl": tables.JsonTables,
-}
-_FORMATS = (".csv", ".parquet", ".jsonl", *_FOLDERS)
+_TABLES = (".csv", ".parquet", ".jsonl")
+_FORMATS = (*_TABLES, *(f"/{suffix}" for suffix in _TABLES))
 _SHOWN = 20  # columns in a message: a log may have hundreds
 _MESSAGE = "/can/"  # begins the topic of a message's signals
 
@@ -44,14 +35,14 @@ class ExportSource:
     start: float = 0.0
     end: float | None = None
     columns: Sequence[str] | None = None
-    damages: list[logs.LogDamage] = field(default_factory=list)
+    damages: list[LogDamage] = field(default_factory=list)
 
-    def frames(self) -> tuple[tuple[int | None, int | None], Iterator[list[Frame]]]:
+    def frames(self) -> tuple[tuple[int | None, int | None], FrameColumns]:
         """(the part that is wanted [ns since the epoch], its frames); InputError if there are none."""
-        section = log_section(self.log, self.start, self.end)
-        batches = logs.read_frames(self.log, *section, self.damages.append)
-        if (first := next(batches, None)) is not None:
-            return section, chain([first], batches)
+        found = logs.read_log(self.log, on_damage=self.damages.append)
+        section = log_section(self.log, found, self.start, self.end)
+        if len(frames := found.between(*section)):
+            return section, frames
         where = "this log" if section == (None, None) else "the chosen part"
         why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in self.damages)
         raise InputError(f"{self.log}: no frames in {where}{why}")
@@ -127,11 +118,11 @@ def write_estimates(source: ExportSource, files: Mapping[str, Path]) -> int:
 
 def holds_frames(log: Path) -> bool:
     """Whether a log holds a frame; of one in another format than ours it is taken for granted."""
-    return logs.log_suffix(log) != ".mcap" or next(logs.read_frames(log, on_damage=lambda _: None), None) is not None
+    return logs.log_suffix(log) != ".mcap" or len(logs.read_log(log, on_damage=lambda _: None)) > 0
 
 
 def _other(log: Path) -> str:
-    if next(logs.read_frames(log, on_damage=lambda _: None), None) is not None:
+    if len(logs.read_log(log, on_damage=lambda _: None)):
         return f"; it holds frames, of which `gz-onboard estimate {log.name}` makes them"
     return ""
 
@@ -184,9 +175,9 @@ def signals_of(source: ExportSource, files: list[Path] | None, vehicle: Vehicle 
     if not holds_frames(source.log) and recorded_messages(source.log):
         decoder, (columns, decoded) = None, recorded_signals(source)
     else:
-        _, batches = source.frames()
+        _, frames = source.frames()
         decoder = decoder_of(source.log, files, vehicle)
-        columns, decoded = decoder.columns, decoder.decode(batches)
+        columns, decoded = decoder.columns, decoder.decode(frames.batches())
     wanted = chosen(source, (column for of in columns.values() for column in of))
     kept = {message: {c: unit for c, unit in of.items() if c in wanted} for message, of in columns.items()}
     if source.columns is not None:
@@ -194,48 +185,21 @@ def signals_of(source: ExportSource, files: list[Path] | None, vehicle: Vehicle 
     return LogSignals(kept, decoded, decoder)
 
 
-class KeptSignals:
-    """A table of each message, in memory."""
-
-    def __init__(self) -> None:
-        self._parts: dict[str, tuple[list[int], dict[str, list[NDArray[Any]]]]] = {}
-
-    def write(self, message: str, times: list[int], rows: list[Values]) -> None:
-        """As of `tables.Sink`."""
-        known, parts = self._parts.setdefault(message, ([], {name: [] for name in rows[0]}))
-        known += times
-        for name, arrays in parts.items():
-            arrays.append(array_of([row[name] for row in rows]))
-
-    def messages(self) -> dict[str, tuple[list[int], Columns]]:
-        """By message times [ns since the epoch] and columns."""
-        import numpy as np
-
-        return {
-            message: (times, {name: np.concatenate(arrays) for name, arrays in parts.items()})
-            for message, (times, parts) in self._parts.items()
-        }
-
-
 def write_signals(source: ExportSource, out: Path, suffix: str, signals: LogSignals) -> int:
-    """Signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
+    """Write signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
 
     suffix: of `out`; of a folder, that of its tables with a slash before.
     """
     if suffix not in _FORMATS:
         raise InputError(f"{source.log}: its signals can be written to .csv, .parquet, .jsonl, .mcap or a directory")
-    with ExitStack() as stack:
-        sink: tables.Sink
-        if suffix == ".parquet":
-            sink = tables.ParquetLong(out, stack)
-        elif suffix == ".csv":
-            sink = tables.CsvLong(stack.enter_context(tables.open_text(out)))
-        elif suffix == ".jsonl":
-            sink = tables.JsonLong(stack.enter_context(tables.open_text(out)))
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            sink = _FOLDERS[suffix](out, signals.columns, stack)
-        return tables.write_signals(signals.decoded, sink)
+    messages = tables.by_message(signals.decoded)
+    if suffix.startswith("/"):
+        out.mkdir(parents=True, exist_ok=True)
+        for message, rows in messages.items():
+            tables.write_table(out / f"{message}{suffix[1:]}", rows.columns, rows.times)
+    else:
+        tables.write_long(out, messages)
+    return sum(len(rows.times) for rows in messages.values())
 
 
 class DecoderError(InputError):

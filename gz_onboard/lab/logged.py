@@ -7,10 +7,11 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.logs import LogDamage, read_samples
 from gz_onboard.errors import InputError
 from gz_onboard.events import State
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
+from gz_onboard.recording.logs import read_samples
+from gz_onboard.recording.readers.contents import LogDamage
 
 Logged = dict[str, Any]
 """The values of one sample in a log, as its JSON has them."""

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import DROPPING
-from gz_onboard.bus.logs import LogDamage, logs_among, read_metadata
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import BAD_INPUT, OK, InputError, writing
 from gz_onboard.events import Activity, Reason, State, words
@@ -38,6 +37,8 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import PICTURE_FORMATS, add_shared
+from gz_onboard.recording.logs import logs_among, read_metadata
+from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import unreadable
+from gz_onboard.recording.logs import logs_among
 
 _LOG = logging.getLogger(__name__)
 

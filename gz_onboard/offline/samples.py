@@ -6,20 +6,23 @@ The lab knows no other form of a ride. A log, a simulated ride and any other sou
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
-from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError, brief, nearest, shown
-from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, Frame, hexadecimal
+from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, hexadecimal
 from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.options import MOST_PAYLOAD
+from gz_onboard.recording.decode import decode_columns
+from gz_onboard.recording.frames import BATCH, FrameColumns
+from gz_onboard.recording.logs import is_table, log_stem, read_log
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.timeline import stray
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -73,67 +76,47 @@ def read_samples(log: Path | SignalTable, vehicle: Vehicle, progress: Callable[[
     """
     mapping, frames = open_ride(log, vehicle)
     file = log.name if isinstance(log, SignalTable) else log
-    columns = read_roles(file, vehicle, (Codec(extended(mapping), LONGEST_PAUSE_NS), frames), progress)
+    columns = read_roles(file, vehicle, Codec(extended(mapping), LONGEST_PAUSE_NS), frames)
+    if progress:
+        progress(len(frames))
     return Samples(ride_name(file), columns, {} if isinstance(log, SignalTable) else facts_of(log))
 
 
 def open_ride(
     log: Path | SignalTable, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
-) -> tuple[BusMapping, Iterator[list[Frame]]]:
+) -> tuple[BusMapping, FrameColumns]:
     """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
 
-    on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
+    on_damage: as of `read_frames`. Raises InputError for another file, for frames without times, and for a log of a
     vehicle without DBC files.
     """
     time = vehicle.mapping.time.name if vehicle.mapping.time else ""
     if isinstance(log, SignalTable) or is_table(log, time):
         return signal_frames(log if isinstance(log, SignalTable) else read_table(log), vehicle.mapping)
-    frames = read_frames(log, on_damage=on_damage)
     if not vehicle.mapping.reads_frames:
         raise vehicle.error(
             f"dbc is missing: without it a table of signals can be read, but no frames as in {log}; of a "
             "table say which column is the time: [table] time = { column = ..., unit = ... }"
         )
-    return vehicle.mapping, _timed(log, frames)
-
-
-def _timed(log: Path, frames: Iterator[list[Frame]]) -> Iterator[list[Frame]]:
-    """`frames`; InputError if they have no times."""
-    first = next(frames, [])
-    if len(first) > 1 and not any(frame[0] for frame in first):
+    frames = read_log(log, on_damage=on_damage)
+    if len(frames) > 1 and not frames.time_ns[:BATCH].any():
         raise InputError(f"{log}: its frames have no times, which a ride needs; candump -L writes them")
-    yield first
-    yield from frames
+    return vehicle.mapping, frames
 
 
-def read_roles(
-    log: Path,
-    vehicle: Vehicle,
-    source: tuple[Codec, Iterable[list[Frame]]],
-    progress: Callable[[int], None] | None = None,
-) -> dict[str, tuple[Array, Array]]:
-    """(times [s], values) by role of all that is decoded in `log` more than once.
+def read_roles(log: Path, vehicle: Vehicle, codec: Codec, frames: FrameColumns) -> dict[str, tuple[Array, Array]]:
+    """Decode the frames of `log`: (times [s], values) by role, of all that came more than once.
 
-    source: the codec and the frames of the log. progress: called with the number of frames read. Raises InputError for
-    a log that cannot be read or is not of the vehicle.
+    codec: a new one, which is left as if it had decoded the frames. Raises InputError for a log that is not of the
+    vehicle.
     """
-    import numpy as np
-
-    codec, frames = source
-    found: dict[str, tuple[list[float], list[float]]] = {}
-    slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
-    for batch, count in without_lone(frames, codec.odd):
-        for frame in batch:
-            codec.decode((frame,))
-            for window in codec.windows():
-                for (times, column), sample in zip(slots[window.group], window.roles, strict=True):
-                    if sample is not None:
-                        times.append(sample.time)
-                        column.append(sample.value)
-        if progress:
-            progress(count)
+    odd = stray(frames.time_ns)
+    if odd.any():
+        codec.odd(frames[odd].tuples())
+        frames = frames[~odd]
+    columns = decode_columns(frames, codec)
     check_ridden(log, vehicle, codec)
-    return {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
+    return {role: column for role, column in columns.items() if len(column[0]) > 1}
 
 
 def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:

@@ -12,20 +12,22 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from struct import Struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources
-from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
-from gz_onboard.events import EFF_FLAG, ROLES, Frame
+from gz_onboard.events import EFF_FLAG, ROLES
+from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
+from gz_onboard.recording.readers.contents import LogDamage, unpacked
 from gz_onboard.routes.columns import separated
 
 if TYPE_CHECKING:
@@ -41,7 +43,6 @@ _ALSO = {"speed": "vehicle_speed"}
 _WORDS = {"battery": "pack", "soc": "bms_state_of_charge", "temp": "temperature", "velocity": "speed"}
 _MISSING = ("", "nan", "nat", "null", "none", "n/a", "<na>")
 _LAST = ("motor_speed", "inverter_voltage", "pack_voltage")  # the estimator makes its step with the last that is there
-_VALUE = Struct("<d")
 _LONGEST_STEP = 30.0  # s, the usual one from row to row: beyond it nothing can be followed
 _COARSEST = 1.0  # s: times of whole seconds are clocks', coarser ones that several rows share were rounded
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
@@ -73,7 +74,7 @@ def read_table(file: Path) -> SignalTable:
     return SignalTable(file, *(_parquet(file) if _is_parquet(file) else _csv(file)))
 
 
-def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, Iterator[list[Frame]]]:
+def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, FrameColumns]:
     """The mapping that the ride in a table is decoded by, and its frames, for a vehicle with `mapping`.
 
     The columns have the names of roles; or, for a vehicle without DBC files, those that its roles name. Raises
@@ -105,7 +106,7 @@ def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, 
     }
     numbers = {m.name: m.frame_id | EFF_FLAG for m in database.messages}
     made = replace(mapping, database=database, sources=sources, protection={}, periods=periods, j1939=False)
-    return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
+    return made, _frames(times, [numbers[name] for name in values], list(values.values()))
 
 
 def is_time(name: str) -> bool:
@@ -120,7 +121,7 @@ def _is_parquet(file: Path) -> bool:
 
 def _csv(file: Path) -> tuple[list[str], Rows]:
     try:
-        data = bytes(unpacked(file, file.read_bytes(), Damage()))
+        data = bytes(unpacked(file.read_bytes(), LogDamage(file)))
     except OSError as error:
         raise unreadable(file, error) from error
     try:
@@ -340,13 +341,13 @@ def _period(where: str, times: Sequence[int], name: str, values: Sequence[float 
     return period
 
 
-def _frames(times: Sequence[int], columns: Sequence[tuple[int, list[float | None]]]) -> Iterator[list[Frame]]:
-    pack: Callable[[float], bytes] = _VALUE.pack
-    batch: list[Frame] = []
-    for row, time in enumerate(times):
-        batch += [(time, identifier, pack(v), 0) for identifier, values in columns if (v := values[row]) is not None]
-        if len(batch) >= BATCH:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
+def _frames(
+    times: Sequence[int], identifiers: Sequence[int], columns: Sequence[Sequence[float | None]]
+) -> FrameColumns:
+    """A frame for each value, row by row."""
+    values = np.array(columns, float).reshape(len(columns), len(times)).T  # None becomes nan
+    row, column = np.nonzero(~np.isnan(values))
+    frames = FrameColumns.empty(len(row), 8)
+    frames.time_ns[:], frames.identifier[:] = np.array(times, np.int64)[row], np.array(identifiers, np.uint32)[column]
+    frames.length[:], frames.data[:] = 8, values[row, column].astype("<f8").view(np.uint8).reshape(-1, 8)
+    return frames

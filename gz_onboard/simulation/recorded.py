@@ -16,7 +16,6 @@ import numpy as np
 
 from gz_onboard.arrays import Array, block_means, held_at, running_mean
 from gz_onboard.bus.codec import LONGEST_PAUSE_NS
-from gz_onboard.bus.stamps import without_lone
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate
@@ -26,6 +25,7 @@ from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import first_soc, standing_load
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.timeline import stray
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -124,7 +124,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     mapping, frames = open_ride(log, vehicle)
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
     pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
-    for batch, _ in without_lone(frames, pipeline.codec.odd):
+    for batch in frames[~stray(frames.time_ns)].batches():
         pipeline.advance(batch, batch[-1][0])
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:

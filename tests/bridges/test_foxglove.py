@@ -22,11 +22,11 @@ from gz_onboard.bridges import foxglove as command
 from gz_onboard.bridges.foxglove import LAYOUT
 from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.bus._can import can
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.location_rows import LOCATION_SCHEMA
 from gz_onboard.log_rows import ESTIMATE_UNITS, TEXTS, declare, estimate_row
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 from tests.bridges import foxglove_clients
 from tests.bridges.broker import wait_for

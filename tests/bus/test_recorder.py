@@ -16,12 +16,15 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.background import Background
-from gz_onboard.bus import framelog, logfile, logs
+from gz_onboard.bus import framelog, logfile
 from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
+from gz_onboard.recording import logs
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.readers.mcap import decode_block
 
 START = 1_750_000_000_000_000_000  # 2025-06-15T15:06:40Z
 SECOND = 1_000_000_000
@@ -90,7 +93,7 @@ def test_another_mcap_reader_finds_topics_schemas_and_json(tmp_path: Path) -> No
         assert (channel.message_encoding, channel.metadata) == ("json", {"rate": "1 Hz"})
         assert message.log_time == batches[50][0][0]
         blocks = [message.data for _, _, message in reader.iter_messages(framelog.TOPIC)]
-        assert [frame for block in blocks for frame in framelog.decode_block(block)] == flat(batches)
+        assert [frame for block in blocks for frame in decode_block(block).tuples()] == flat(batches)
         assert [attachment.name for attachment in reader.iter_attachments()] == ["a.dbc"]
         late = list(reader.iter_messages("/estimate", starting_at=batches[60][0][0]))
         assert len(late) == 1
@@ -108,7 +111,7 @@ def test_no_block_holds_more_than_its_frames_or_a_second(tmp_path: Path) -> None
     file.close()
     with (tmp_path / "a.mcap").open("rb") as read_stream:
         for _, _, message in make_reader(read_stream).iter_messages(log_time_order=False):
-            sizes.append(framelog.decode_block(message.data))
+            sizes.append(decode_block(message.data).tuples())
             assert message.log_time == sizes[-1][0][0]
     assert flat(sizes) == sparse + dense + back + sparse
     assert max(map(len, sizes)) <= logfile.BLOCK_FRAMES
@@ -125,7 +128,7 @@ def test_a_file_cut_off_at_any_time_is_readable_up_to_the_last_two_seconds(tmp_p
     copy = tmp_path / "copy" / "cut.mcap"
     copy.parent.mkdir()
     copy.write_bytes(log.path.read_bytes())
-    damages: list[logs.LogDamage] = []
+    damages: list[LogDamage] = []
     there = [frame for batch in logs.read_frames(copy, on_damage=damages.append) for frame in batch]
     assert there == flat(batches)[: len(there)]
     end = there[-1][0] if there else START
@@ -416,7 +419,7 @@ def test_a_log_cut_off_anywhere_is_read_as_far_as_it_was_synced(tmp_path: Path) 
     source = random.Random(2)
     for number, length in enumerate([there, there - 1, *(source.randrange(2000, there) for _ in range(60))]):
         path.write_bytes(data[:length] + (b"", bytes(3000), source.randbytes(3000))[number % 3])
-        damages: list[logs.LogDamage] = []
+        damages: list[LogDamage] = []
         found = [frame for batch in logs.read_frames(path, on_damage=damages.append) for frame in batch]
         assert found == sent[: len(found)]
         assert len(damages) == 1

@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 
 from gz_onboard import state
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import TRANSMITTED
+from gz_onboard.recording.logs import read_frames
 from tests.support import LOGS, ROOT, S, range_database, reference
 
 GUEST = ROOT / "tests" / "vcan-guest"

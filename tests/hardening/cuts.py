@@ -21,13 +21,15 @@ from random import Random
 from typing import Any
 from unittest import mock
 
+from mcap.writer import MCAP0_MAGIC
+
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.logs import LogDamage, read_frames
-from gz_onboard.bus.readers.mcap import MAGIC
 from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.readers.contents import LogDamage
 from tests.hardening import _ext4
 from tests.hardening.report import Report
 from tests.support import S, Scooter, reference
@@ -178,7 +180,7 @@ def judge(cut: Cut, folder: Path, daemon: Daemon, found: Found) -> None:
         (folder / name).write_bytes(data)
     last_ns = cut.begin_ns
     for log in sorted(folder.glob("*.mcap")):
-        if log.read_bytes()[:8] != MAGIC:  # just begun, nothing of it was synced
+        if log.read_bytes()[:8] != MCAP0_MAGIC:  # just begun, nothing of it was synced
             continue
         damages: list[LogDamage] = []
         for batch in read_frames(log, on_damage=damages.append):

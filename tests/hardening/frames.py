@@ -23,6 +23,7 @@ from gz_onboard.daemon.loop import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import TICK_NS
+from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import Vehicle
 from tests.events import events_of
 from tests.hardening.report import Report
@@ -241,18 +242,7 @@ def live(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
 
 def offline(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
     """As an estimate of a log does it."""
-    portions: list[list[Frame]] = [[]]
-    for _, frame in frames:
-        portions[-1].append(frame)
-        if len(portions[-1]) >= PORTION:
-            portions.append([])
-    if not portions[-1]:
-        portions.pop()
-
-    def checked() -> Iterator[list[Frame]]:
-        for portion in portions:
-            yield portion
-            watch.check()
+    taken = [frame for _, frame in frames]
 
     codec, odd = watch.run.pipeline.codec, watch.run.pipeline.codec.odd
 
@@ -261,7 +251,7 @@ def offline(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
         watch.second.odd(frames)
 
     codec.odd = told  # type: ignore[method-assign]
-    feed(watch.run.pipeline, checked())
+    feed(watch.run.pipeline, FrameColumns.of(taken), lambda _: watch.check())
     watch.check()
 
 

@@ -15,8 +15,8 @@ from functools import cache
 from itertools import chain
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate, State
+from gz_onboard.recording.logs import read_frames
 from tests.events import Event, EventEstimator, events_of
 from tests.hardening.report import Report
 from tests.support import LOGS, reference

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.export import write_frames_as
-from gz_onboard.bus.logs import read_frames
+from gz_onboard.recording.export import write_frames_as
+from gz_onboard.recording.logs import read_frames
 from tests.support import LOGS
 
 ENOUGH = 4000  # frames, of some seconds

@@ -19,7 +19,6 @@ import pytest
 import gz_onboard as gz
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.recorder import is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
@@ -28,6 +27,7 @@ from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_order import span_of
 from gz_onboard.lab.estimate_ride import open_estimate
 from gz_onboard.pipeline import TICK_NS
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.lab.short_logs import short_log
 from tests.support import S, identifier, recorded, reference, with_cell_voltages, write_log
@@ -295,7 +295,7 @@ def test_a_signal_shows_which_vehicle_it_is(short, tmp_path):
         write_log(log := tmp_path / "numbered.blf", sorted([*frames, *own]))
         ride = open_estimate(log, read_vehicle(file))
         assert ride.vehicle.name == f"reference-scooter{shown}"
-        assert sum(map(len, ride.batches)) == len(frames) + len(own)
+        assert len(ride.frames) == len(frames) + len(own)
 
 
 def test_what_does_not_go_together(short, tmp_path, capsys):

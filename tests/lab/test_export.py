@@ -6,6 +6,7 @@ import gzip
 import json
 import re
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,12 @@ from mcap.reader import make_reader
 from gz_onboard import cli
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.signals import Decoder, column_name
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export as command
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, write_log
 
@@ -409,11 +411,11 @@ def test_nothing_half_written_has_the_name(
 ) -> None:
     (tmp_path / name).write_text("before")
 
-    def interrupted(*given: Any, **more: Any) -> Any:
-        yield from list(read_frames(*given, **more))[:2]
+    def interrupted(frames: FrameColumns) -> Iterator[list[Frame]]:
+        yield frames[:2000].tuples()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gz_onboard.bus.logs.read_frames", interrupted)
+    monkeypatch.setattr(FrameColumns, "batches", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(log, tmp_path / name)
     assert (tmp_path / name).read_text() == "before"

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Cause, Explanation, words
 from gz_onboard.lab import logged, plot
 from gz_onboard.lab.why import draw_why
+from gz_onboard.recording.readers.contents import LogDamage
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
 

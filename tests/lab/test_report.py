@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gz_onboard as gz
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.lab import report_page
@@ -22,6 +21,7 @@ from gz_onboard.lab.report_ride import path_of
 from gz_onboard.lab.report_svg import GRAIN, axis_of, band, draw_map, line, stretches
 from gz_onboard.lab.why import Why
 from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.logs import read_frames
 from tests.support import LOGS, write_log
 
 VALUES = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60)

@@ -33,9 +33,9 @@ def ride(**columns: Any) -> dict[str, Any]:
 
 def currents(data: object) -> list[tuple[float, float]]:
     """(time from the first [s], current [A]) of each frame that has one."""
-    made, batches = signal_frames(signal_table(data), MAPPING)
+    made, columns = signal_frames(signal_table(data), MAPPING)
     identifier = made.database.get_message_by_name("pack_current").frame_id
-    frames = [frame for batch in batches for frame in batch]
+    frames = columns.tuples()
     return [
         ((time - frames[0][0]) * 1e-9, struct.unpack("<d", value)[0])
         for time, at, value, _ in frames

@@ -11,15 +11,16 @@ prints what moved and by how much, and writes the new results.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.bus.logs import read_frames
-from gz_onboard.events import WINDOW, Estimate, Frame
+from gz_onboard.events import WINDOW, Estimate
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.log_rows import estimate_row
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.logs import read_log
 from gz_onboard.vehicle import read_vehicle
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
@@ -109,10 +110,10 @@ def golden_file(log: Path) -> Path:
     return GOLDEN / f"{log.stem}.csv"
 
 
-def estimates(batches: Iterable[Sequence[Frame]], filter_name: str = "scalar") -> list[Estimate]:
+def estimates(frames: FrameColumns, filter_name: str = "scalar") -> list[Estimate]:
     """Every estimate that the pipeline of the reference scooter makes of the frames."""
     made: list[Estimate] = []
-    feed(Pipeline(read_vehicle("reference"), filter_name=filter_name, observer=made.append), batches)
+    feed(Pipeline(read_vehicle("reference"), filter_name=filter_name, observer=made.append), frames)
     return made
 
 
@@ -124,7 +125,7 @@ def sampled(made: Sequence[Estimate]) -> list[Row]:
 
 def run(log: Path) -> list[Row]:
     """The rows that the pipeline makes of `log` now."""
-    return sampled(estimates(read_frames(log)))
+    return sampled(estimates(read_log(log)))
 
 
 def _text(value: object) -> str:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.events import WINDOW, Reason, State
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.parts.road import Dynamometer

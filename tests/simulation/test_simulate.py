@@ -10,8 +10,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from gz_onboard.bus.logs import read_samples
 from gz_onboard.cli import main
+from gz_onboard.recording.logs import read_samples
 from gz_onboard.simulation.run import COLUMNS
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
 from gz_onboard.simulation.sweep import read_sweep

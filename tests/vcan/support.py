@@ -17,8 +17,8 @@ from typing import Any
 import can
 import pytest
 
-from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, State
+from gz_onboard.recording.logs import read_frames, read_samples
 from tests.support import LOGS, range_database
 
 COASTDOWN = LOGS / "coastdown.blf"

@@ -1,4 +1,4 @@
-"""Replay over a real socket; what it does otherwise stands in tests/bus/test_replay.py."""
+"""Replay over a real socket; what it does otherwise stands in tests/recording/test_replay.py."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import can
 
-from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.events import EFF_FLAG, RTR_FLAG, Frame
-from tests.bus.test_replay import START, frames, log, payload, run
+from gz_onboard.recording.readers.python_can import frame_of
+from tests.recording.test_replay import START, frames, log, payload, run
 
 
 def test_a_real_socket_carries_every_kind_of_frame(tmp_path: Path) -> None:

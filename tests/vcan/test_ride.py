@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate, Frame, State
 from gz_onboard.log_rows import estimate_row
+from gz_onboard.recording.logs import read_frames
 from tests.support import MS, ROOT, S, check_frames, recorded, ridden
 from tests.vcan.support import COASTDOWN, Daemon, Listener, Running, number, raw_frames
 

@@ -10,6 +10,7 @@ from gz_onboard.estimator.reasons import LOSS_SD
 from gz_onboard.events import Estimate, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import lacking
+from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import Run, Scooter, reference
 
@@ -25,7 +26,7 @@ def without(folder: Path, roles: str) -> Vehicle:
 
 def last(vehicle: Vehicle) -> Estimate:
     run = Run(vehicle)
-    feed(run.pipeline, [Scooter().steady(60.0, current=20.0)])
+    feed(run.pipeline, FrameColumns.of(Scooter().steady(60.0, current=20.0)))
     return run.estimates[-1]
 
 
@@ -56,7 +57,7 @@ def test_of_a_sensor_that_it_has_in_part_the_rest_is_watched(tmp_path):
         for f in Scooter().steady(30.0, current=20.0)
         if vehicle.mapping.database.get_message_by_frame_id(f[1]).name != "IMU_Acceleration"
     ]
-    feed(run.pipeline, [silent])
+    feed(run.pipeline, FrameColumns.of(silent))
     assert run.estimates[-1].reasons & Reason.NO_IMU
     assert run.estimates[-1].state is State.DEGRADED
 
@@ -67,7 +68,7 @@ def test_a_pack_that_shows_nothing_is_still_invalid(tmp_path):
     assert lacking(vehicle) == ["NO_PACK_VOLTAGE", "NO_PACK_CURRENT"]
     run = Run(vehicle)
     frames = Scooter().steady(30.0, current=20.0)
-    feed(run.pipeline, [frames])
+    feed(run.pipeline, FrameColumns.of(frames))
     before = len(run.estimates)
     run.pipeline.advance([], frames[-1][0] + 4_000_000_000)
     assert [run.estimates[i].state for i in (before - 1, -1)] == [State.VALID, State.INVALID]  # first by the inverter's

@@ -20,10 +20,11 @@ import pytest
 
 from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
 from gz_onboard.bus.dbc import load_database
-from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.mapping import pgn, read_mapping
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import Event, events_of

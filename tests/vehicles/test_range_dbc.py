@@ -16,6 +16,7 @@ from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import EFF_FLAG, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import Pipeline, dbc_texts
+from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import Run, Scooter, check_sound
 
@@ -55,7 +56,7 @@ def test_a_range_too_long_for_its_range_frames_is_refused(tmp_path):
 def test_the_large_frames_all_the_way(tmp_path):
     vehicle = van(tmp_path, LARGE)
     run = Run(vehicle)
-    feed(run.pipeline, [Scooter().steady(20.0, current=80.0)])
+    feed(run.pipeline, FrameColumns.of(Scooter().steady(20.0, current=80.0)))
     check_sound(run)
     database = load_database([find_dbc("range_large.dbc")])
     last = {identifier: data for _, identifier, data, _ in run.sent}
@@ -71,7 +72,7 @@ def test_the_large_frames_all_the_way(tmp_path):
 def test_a_file_of_ones_own_beside_the_vehicle_file(tmp_path):
     text = find_dbc("range_large.dbc").read_text(encoding="utf-8").replace("1552", str(0x18FF6000 | EFF_FLAG))
     run = Run(van(tmp_path, 'range_dbc = "mine.dbc"', text))
-    feed(run.pipeline, [Scooter().steady(5.0, current=80.0)])
+    feed(run.pipeline, FrameColumns.of(Scooter().steady(5.0, current=80.0)))
     assert {frame[1] for frame in run.sent} == {0x18FF6000 | EFF_FLAG, *range(0x611, 0x618)}
     assert run.estimates[-1].state in (State.VALID, State.DEGRADED)
     assert "mine.dbc" in dbc_texts(run.pipeline.vehicle)
@@ -125,7 +126,7 @@ def test_identifiers_of_ones_own(number, identifiers, tmp_path):
     """What is sent, what is said to be sent, and the DBC file that is written and logged agree."""
     vehicle = van(tmp_path, f"{LARGE}\nrange_identifier = {number}")
     run = Run(vehicle)
-    feed(run.pipeline, [Scooter().steady(5.0, current=80.0)])
+    feed(run.pipeline, FrameColumns.of(Scooter().steady(5.0, current=80.0)))
     assert {frame[1] for frame in run.sent} == run.pipeline.publisher.identifiers == set(identifiers)
     assert main(["run", "--vehicle", str(vehicle.file), "--write-dbc", str(tmp_path / "written.dbc")]) == 0
     assert (tmp_path / "written.dbc").read_bytes() == dbc_texts(vehicle)["range_large.dbc"]
@@ -173,7 +174,7 @@ def test_someone_else_who_sends_on_ours_is_counted(tmp_path):
     run = Run(van(tmp_path, LARGE))
     frames = Scooter().steady(3.0, current=80.0)
     others = [(frame[0], 0x611, bytes(8), 0) for frame in frames[::100]]
-    feed(run.pipeline, [sorted(frames + others)])
+    feed(run.pipeline, FrameColumns.of(sorted(frames + others)))
     assert run.pipeline.foreign == {"0x611": len(others)}
     assert run.pipeline.status()["foreign"] == {"0x611": len(others)}
     assert any("0x611" in line and "someone else" in line for line in summary(run.pipeline))

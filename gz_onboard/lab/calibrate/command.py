@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import OK, InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
@@ -25,6 +24,7 @@ from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.progress import progress_bar
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gz_onboard.bus.logs import log_suffix, logs_among
 from gz_onboard.errors import InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
 from gz_onboard.lab.discover.baseline import LEAST_RIDES, baseline
@@ -28,6 +27,7 @@ from gz_onboard.offline.results import distinct_names, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.recording.logs import log_suffix, logs_among
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 

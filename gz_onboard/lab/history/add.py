@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, TextIO
 
 from gz_onboard import __version__
-from gz_onboard.bus.logs import log_suffix, logs_among, read_metadata, read_samples
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.lab.estimate import expected_frames
 from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through, vehicle_of
@@ -26,6 +25,7 @@ from gz_onboard.offline.results import Failure, leap_text, write_json
 from gz_onboard.offline.samples import facts_of, ride_name
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.recording.logs import log_suffix, logs_among, read_metadata, read_samples
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, find_vehicle
 

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, get_args
 
-from gz_onboard.bus.tables import write_table
 from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.lab.estimate_table import FORMATS, check_table
 from gz_onboard.lab.history.choice import Choice, period, read_rides
@@ -21,6 +20,7 @@ from gz_onboard.lab.history.totals import LearnedAt, NumberedRide, Overview, Tot
 from gz_onboard.offline.results import write_json
 from gz_onboard.offline.style import picture_format, save
 from gz_onboard.options import add_shared
+from gz_onboard.recording.tables import write_table
 
 _KINDS: dict[str, type] = {"number": int, **{name: (get_args(kind) or (kind,))[0] for name, kind in COLUMNS.items()}}
 

@@ -18,7 +18,7 @@ from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import DEFAULT_STALE
-from gz_onboard.events import STALE_PERIODS, Frame, Group, hexadecimal, words
+from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
 from gz_onboard.lab.estimate_tally import PAUSE
 from gz_onboard.lab.vehicle import charge, electric, motion, others
 from gz_onboard.lab.vehicle.features import NEEDS, Feature, features_of, features_text
@@ -28,6 +28,7 @@ from gz_onboard.lab.vehicle.rolling import MOTOR, rolling_of
 from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, seconds_of
 from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
+from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import Vehicle
 
 CHECK_VERSION = 1
@@ -72,8 +73,10 @@ def check_log(
     """Check one log; quick: without `on_board`. Raises InputError for one that cannot be read."""
     mapping, frames = open_ride(log, vehicle)
     codec = Codec(mapping, LONGEST_PAUSE_NS)
-    lengths: dict[int, int] = {}
-    columns = read_roles(log, vehicle, (codec, _recording_lengths(frames, lengths)), progress)
+    columns = read_roles(log, vehicle, codec, frames)
+    if progress:
+        progress(len(frames))
+    lengths = _last_lengths(frames)
     samples = Samples(ride_name(log), columns, facts_of(log))
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += _never_came(codec, columns, lengths, _passed(columns)[0])
@@ -103,11 +106,11 @@ def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
     return end - start - float(steps[steps > PAUSE].sum()), end
 
 
-def _recording_lengths(frames: Iterable[list[Frame]], lengths: dict[int, int]) -> Iterator[list[Frame]]:
-    """The frames; `lengths` gets that of each identifier."""
-    for batch in frames:
-        lengths.update({frame[1]: len(frame[2]) for frame in batch})
-        yield batch
+def _last_lengths(frames: FrameColumns) -> dict[int, int]:
+    """Bytes of the last frame of each identifier."""
+    backwards = frames[::-1]
+    identifiers, last = np.unique(backwards.identifier, return_index=True)
+    return dict(zip(identifiers.tolist(), backwards.length[last].tolist(), strict=True))
 
 
 def _never_came(

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask, block_means
-from gz_onboard.bus.logs import log_suffix
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.motor import read_bench
 from gz_onboard.lab.calibrate.table import read_table
@@ -23,6 +22,7 @@ from gz_onboard.lab.validate_components import losses
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.sensors import road_speed, true_columns
+from gz_onboard.recording.logs import log_suffix
 from gz_onboard.vehicle import Vehicle
 
 MOTOR, INVERTER, BOTH = "motor", "inverter", "motor and inverter"

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.api import AddedRides, History, add_to_history, read_history
-from gz_onboard.bus.logs import read_samples
 from gz_onboard.events import Activity, State
 from gz_onboard.lab.history.log_rides import BREAK, CHARGED, About, moments_of, rides_of
 from gz_onboard.lab.history.ride import KeptRide
 from gz_onboard.lab.history.store import Store
 from gz_onboard.log_rows import STATUS_TOPIC
+from gz_onboard.recording.logs import read_samples
 from tests.lab.history.logs import CURRENT, NOON, SPEED, STEP, VOLTAGE, Told, ride, stand, write_log
 from tests.support import S
 

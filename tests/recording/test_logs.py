@@ -17,15 +17,16 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus import logs
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.logs import LogDamage, json_channels, read_attachments, read_frames, read_metadata, read_samples
-from gz_onboard.bus.readers.common import ChannelNumbers
-from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export
+from gz_onboard.recording import logs
+from gz_onboard.recording.logs import json_channels, read_attachments, read_frames, read_metadata, read_samples
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.readers.python_can import frame_of
+from gz_onboard.recording.readers.text import ChannelNumbers
 from tests.support import write_log
 
 START_S = 1_750_000_000
@@ -448,7 +449,7 @@ import sys
 from gz_onboard.bus._can import can
 heavy = [name for name in ("pandas", "asammdf", "numpy") if name in sys.modules]
 assert not heavy, heavy
-from gz_onboard.bus.logs import read_frames
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.errors import InputError
 try:
     import importlib.util
@@ -477,7 +478,7 @@ def test_an_mf4_of_signals_says_which_it_holds(tmp_path: Path) -> None:
 
 def test_mf4_is_read_as_by_python_can(tmp_path: Path) -> None:
     pytest.importorskip("asammdf")
-    from gz_onboard.bus.readers.pycan import with_asammdf
+    from gz_onboard.recording.readers.python_can import with_asammdf
 
     path = tmp_path / "a.mf4"
     with_asammdf(path)
@@ -641,7 +642,7 @@ def test_a_chunk_whose_head_is_damaged_is_told_or_read(tmp_path: Path, at: int, 
 BOMB = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
-from gz_onboard.bus.logs import read_frames, read_samples
+from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.errors import InputError
 frames = [f for batch in read_frames(sys.argv[1], on_damage=print) for f in batch]
 list(read_samples(sys.argv[1]))

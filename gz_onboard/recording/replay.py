@@ -17,11 +17,13 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.logs import LogDamage, log_suffix, logs_among, read_frames
 from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.logs import log_suffix, logs_among, read_log
+from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
     import can
@@ -99,7 +101,7 @@ def replay(
 def bus_sender(bus: can.BusABC) -> Send:
     """Sends by python-can. Waits for room in a full queue; a bus that is down loses frames, as a bus does."""
     from gz_onboard.bus._can import can
-    from gz_onboard.bus.readers.pycan import message_of
+    from gz_onboard.recording.readers.python_can import message_of
 
     def send(frame: Frame) -> bool:
         for _ in range(_FULL_ATTEMPTS):
@@ -141,31 +143,25 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--speed {arguments.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more"
         )
-    logs = logs_among([arguments.log])
-    if len(logs) > 1 and (arguments.start or arguments.end is not None):
-        raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
-    sections = [log_section(log, arguments.start, arguments.end) for log in logs]
-    for log in logs:
-        read_frames(log)  # a missing log is named before a missing bus
+    damages: list[LogDamage] = []
+    parts = _parts(arguments, damages)  # a missing log is named before a missing bus
     buses = _open_buses(arguments.interface, [name for name in arguments.channel.split(",") if name])
     senders = [bus_sender(bus) for bus in buses]
     summary = Sent()
-    damages: list[LogDamage] = []
     status = OK
     try:
         with progress_bar(lambda: None, quiet=arguments.quiet) as display:
             while True:
                 summary.loops += 1
-                for log, section in zip(logs, sections, strict=True):
-                    what = "the log" if len(logs) == 1 else log.name
+                for log, frames in parts:
+                    what = "the log" if len(parts) == 1 else log.name
 
                     def show(seconds: float, what: str = what) -> None:
                         display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
 
-                    received_only = log_suffix(log) == ".mcap" and not arguments.all
-                    batches = read_frames(log, *section, on_damage=damages.append)
-                    kept = _sendable(batches, received_only, len(senders), summary)
-                    replay(kept, _by_channel(senders), arguments.speed, summary, show)
+                    kept = _sendable(frames, len(senders))
+                    summary.skipped += len(frames) - len(kept)
+                    replay(kept.batches(), _by_channel(senders), arguments.speed, summary, show)
                 if not summary.sent and not summary.failed:
                     raise InputError(f"{arguments.log}: no frames to send in the chosen part")
                 if not arguments.loop:
@@ -182,33 +178,37 @@ def run(arguments: argparse.Namespace) -> int:
     return status
 
 
-def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
-    """--from and --to [s from the first frame] as times [ns] for `read_frames`; InputError if they are none."""
+def _parts(arguments: argparse.Namespace, damages: list[LogDamage]) -> list[tuple[Path, FrameColumns]]:
+    """Read the frames to be sent of each log, before the bus is opened. Raises InputError for a missing log."""
+    logs = logs_among([arguments.log])
+    if len(logs) > 1 and (arguments.start or arguments.end is not None):
+        raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
+    parts = []
+    for log in logs:
+        frames = read_log(log, on_damage=damages.append)
+        frames = frames.between(*log_section(log, frames, arguments.start, arguments.end))
+        if log_suffix(log) == ".mcap" and not arguments.all:
+            frames = frames[frames.channel & TRANSMITTED == 0]
+        parts.append((log, frames))
+    return parts
+
+
+def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
+    """--from and --to [s from the first frame] as times [ns]; InputError if they are none, or there is no frame."""
     if end_s is not None and not end_s > start_s:
         raise InputError(f"--to {end_s:g} s: must be after --from {start_s:g} s")
     if not start_s and end_s is None:
         return None, None
-    first = next(read_frames(path, on_damage=lambda _: None), None)
-    if first is None:
-        raise InputError(f"{path}: no frames in this log")
-    first_ns = first[0][0]
+    if not len(frames):
+        raise InputError(f"{log}: no frames in this log")
+    first_ns = int(frames.time_ns[0])
     return first_ns + round(start_s * 1e9), None if end_s is None else first_ns + round(end_s * 1e9)
 
 
-def _sendable(
-    batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Sent
-) -> Iterable[list[Frame]]:
-    """Leave out error frames, which no host can send, and frames of channels beyond those of the bus."""
-    for batch in batches:
-        kept = [
-            frame
-            for frame in batch
-            if not frame[1] & ERR_FLAG
-            and not (received_only and frame[3] & TRANSMITTED)
-            and (channels == 1 or frame[3] & ~TRANSMITTED < channels)
-        ]
-        summary.skipped += len(batch) - len(kept)
-        yield kept
+def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
+    """Leave out error frames, which no host can send, and frames of further channels."""
+    sendable = frames.identifier & ERR_FLAG == 0
+    return frames[sendable if channels == 1 else sendable & (frames.bus < channels)]
 
 
 def _by_channel(senders: list[Send]) -> Send:

@@ -9,11 +9,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus import logs
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
+from gz_onboard.recording import logs
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -67,7 +67,7 @@ def whole(out: Path, suffix: str) -> Iterator[Path]:
 def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
     """Write the frames to `out` by python-can, in the format of `suffix`; returns their number."""
     from gz_onboard.bus._can import can
-    from gz_onboard.bus.readers.pycan import message_of, with_asammdf
+    from gz_onboard.recording.readers.python_can import message_of, with_asammdf
 
     if suffix == ".mf4":
         with_asammdf(out)

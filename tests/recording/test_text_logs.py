@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.readers.contents import LogDamage
 
 MS = 1_000_000
 S = 1000 * MS

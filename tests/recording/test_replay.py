@@ -12,12 +12,12 @@ from pathlib import Path
 import can
 import pytest
 
-from gz_onboard.bus import replay as command
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.readers.pycan import frame_of
-from gz_onboard.bus.replay import Sent, bus_sender, replay
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from gz_onboard.recording import replay as command
+from gz_onboard.recording.readers.python_can import frame_of
+from gz_onboard.recording.replay import Sent, bus_sender, replay
 from tests.support import HEARS_CTRL_C, write_log
 
 START = 1_750_000_000_000_000_000

@@ -1,9 +1,8 @@
-"""Reading recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
+"""Read recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
 
-BLF, candump and our own files have a reader of their own, five to ten times as fast as one that builds a message
-object for each frame; python-can reads the rest of what it knows. The content tells the format; the name only where
-the content does not. A damaged log is read as far as it can be: what is lost is counted and reported once
-(`LogDamage`), never silently and never by giving up. Times that are not since 1970 are said in a warning.
+The content tells the format; the name only where the content does not. A damaged log is read as far as possible: what
+is lost is counted and reported once (`LogDamage`), never silently and never by giving up. Times that are not since 1970
+are said in a warning.
 
 A frame has the kernel's identifier flags. The data of a remote frame are as many zero bytes as it asked for. A
 CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
@@ -16,40 +15,53 @@ import logging
 import mmap
 import re
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
-from gz_onboard.bus.readers.common import FD_LENGTHS, TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
+from mcap.writer import MCAP0_MAGIC
+
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, Frame
+from gz_onboard.events import MOST_EXTENDED, Frame
+from gz_onboard.recording.frames import FD_LENGTHS, TIME_LIMIT_NS, FrameColumns
+from gz_onboard.recording.readers import blf, mcap, text
+from gz_onboard.recording.readers.contents import Contents, LogDamage, Reader, unpacked
 
 _LOG = logging.getLogger(__name__)
 
 _SAVVYCAN, _TABLE = "SavvyCAN's CSV", "a table"
 
 
-def _refuse_table(path: Path, _data: Contents, _damage: Damage, _start: int | None, _end: int | None) -> Any:
+def _refuse_table(_data: Contents, damage: LogDamage) -> FrameColumns:
     raise InputError(
-        f"{path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
+        f"{damage.path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
     )
+
+
+def _python_can(suffix: str) -> Reader:
+    """A reader that imports python-can on first use, which takes 0.1 s."""
+
+    def read(data: Contents, damage: LogDamage) -> FrameColumns:
+        from gz_onboard.recording.readers import python_can
+
+        return python_can.read(suffix, data, damage)
+
+    return read
 
 
 _READERS: dict[str, Reader] = {
     ".mcap": mcap.read,
     ".blf": blf.read,
-    ".log": candump.read,
-    **{suffix: pycan.text_reader(suffix) for suffix in (".asc", ".csv", ".trc")},
-    ".mf4": pycan.read_mf4,
-    ".crtd": lines.read_crtd,
-    _SAVVYCAN: lines.read_savvycan,
+    ".log": text.read_candump,
+    **{suffix: _python_can(suffix) for suffix in (".asc", ".csv", ".trc", ".mf4")},
+    ".crtd": text.read_crtd,
+    _SAVVYCAN: text.read_savvycan,
     _TABLE: _refuse_table,
 }
-_MAGIC = {b"LOGG": ".blf", mcap.MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
+_MAGIC = {b"LOGG": ".blf", MCAP0_MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
 _FOREIGN_FORMATS = {
     rb"\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x4d\x3c\xb2\xa1|\xa1\xb2\x3c\x4d|\n\r\r\n": (
         "Wireshark's captures are not read; record with candump -L"
@@ -62,15 +74,15 @@ _FOREIGN_FORMATS = {
 }
 """Logs of other tools, by what they begin with, and what to do with them."""
 _FIRST_LINES = {
-    _SAVVYCAN: lines.SAVVYCAN_HEADER,
+    _SAVVYCAN: text.SAVVYCAN_HEADER,
     ".csv": re.compile(r"timestamp,arbitration_id,"),
     ".asc": re.compile(
-        rf"{pycan.ASC_BASE.pattern}|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
+        r"\s*base\s+(?:hex|dec)|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
         re.I,
     ),
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
-    ".crtd": lines.CRTD_LINE,
-    ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
+    ".crtd": text.CRTD_LINE,
+    ".log": re.compile(rf"(?:{text.CANDUMP_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
 _TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
@@ -79,18 +91,29 @@ ESTIMATED = ".estimate.mcap"
 _HEAD = 8192  # bytes within which a text log shows what it is
 
 
-@dataclass(frozen=True)
-class LogDamage:
-    """What could not be read of a log: how many pieces (lines, objects, chunks), and the first of them."""
+def read_log(
+    path: str | Path,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    on_damage: Callable[[LogDamage], None] | None = None,
+) -> FrameColumns:
+    """Read the frames of a log, in the order of the file.
 
-    path: Path
-    count: int
-    place: str
-    reason: str
-
-    def __str__(self) -> str:
-        more = f" and {self.count - 1} more" if self.count > 1 else ""
-        return f"{self.path}: {self.place}: {self.reason}{more}: skipped"
+    start_ns, end_ns: only frames with start_ns <= time < end_ns [ns since the epoch, as in the log]. on_damage is
+    called once if something could not be read; without it a warning is logged. Raises InputError for a file that is
+    missing or not of the format that its content or name says.
+    """
+    path = Path(path)
+    suffix, damage = log_suffix(path), LogDamage(path)
+    frames = _READERS[suffix](unpacked(_load(path), damage), damage)
+    impossible = frames.impossible()
+    if impossible.any():
+        for frame in frames[impossible].tuples():
+            damage.add("a frame", _problem(frame))
+        frames = frames[~impossible]
+    if damage.count:
+        (on_damage or _warn)(damage)
+    return frames.between(start_ns, end_ns)
 
 
 def read_frames(
@@ -99,17 +122,8 @@ def read_frames(
     end_ns: int | None = None,
     on_damage: Callable[[LogDamage], None] | None = None,
 ) -> Iterator[list[Frame]]:
-    """The frames of a log in the order in which they stand in it, in lists of up to about a thousand.
-
-    start_ns, end_ns: only frames with start_ns <= time < end_ns [ns since the epoch, as in the log].
-    on_damage is called once, after the last frame, if something could not be read; without it a warning is logged.
-    Raises InputError for a file that is missing or not of the format that its suffix says; a missing file or
-    unknown suffix at once, the rest when the first frames are asked for.
-    """
-    path = Path(path)
-    suffix = log_suffix(path)
-    data = _load(path)
-    return _filtered(path, _READERS[suffix], data, start_ns, end_ns, on_damage or _warn)
+    """Read the frames of a log as tuples, in lists of up to a thousand; arguments and errors as of `read_log`."""
+    return read_log(path, start_ns, end_ns, on_damage).batches()
 
 
 def log_suffix(path: Path) -> str:
@@ -146,7 +160,7 @@ def is_table(path: Path, time: str = "") -> bool:
 
 
 def _head(path: Path) -> bytes:
-    """The first bytes of a file, unpacked; none of one that cannot be read."""
+    """The first bytes of a file, unpacked; empty if the file cannot be read."""
     head = b""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(_HEAD)
@@ -200,7 +214,7 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
 
 
 def _expanded(path: Path) -> list[Path]:
-    """The files that a pattern stands for, or the path itself."""
+    """The files that match a pattern, or the path itself."""
     if any(letter in str(path) for letter in "*?[") and not path.exists():
         try:
             found = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
@@ -218,12 +232,12 @@ def log_stem(log: Path) -> str:
 
 
 def _suffixes() -> str:
-    """Of logs, for messages."""
+    """The suffixes of logs, for messages."""
     return ", ".join(name for name in _READERS if name.startswith("."))
 
 
 def _may_be_table(file: Path) -> bool:
-    """By its name: a text of any kind may look like one."""
+    """Whether the name allows a table; the content of any text may look like one."""
     return file.name.lower().removesuffix(".gz").endswith((".csv", ".txt", ".parquet"))
 
 
@@ -235,20 +249,24 @@ def _is_log(file: Path, estimates: bool | None) -> bool:
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
     """The files attached to one of our own logs by name, such as the DBC files; of other formats none."""
-    own = _own(path)
-    return mcap.attachments(*own) if own else {}
+    own = _own(LogDamage(Path(path)))
+    return own.attachments if own else {}
 
 
 def read_metadata(path: str | Path, record: str = "gz_onboard") -> dict[str, str]:
     """The metadata of one of our own logs (vehicle, version, ...), or another record of it; of other formats none."""
-    own = _own(path)
-    return mcap.metadata(*own, record) if own else {}
+    own = _own(LogDamage(Path(path)))
+    return own.metadata.get(record, {}) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
     """Schema (a JSON text) and metadata of each topic of samples in one of our own logs; of other formats none."""
-    own = _own(path)
-    return mcap.json_channels(*own) if own else {}
+    if not (own := _own(LogDamage(Path(path)))):
+        return {}
+    if not own.channels:  # only the chunks of a log that was cut off declare them
+        deque(own.messages(), maxlen=0)
+    found = (channel for channel in own.channels.values() if channel.message_encoding == "json")
+    return {channel.topic: (own.schemas.get(channel.schema_id, b"{}"), channel.metadata) for channel in found}
 
 
 def read_samples(
@@ -257,29 +275,31 @@ def read_samples(
     end_ns: int | None = None,
     on_damage: Callable[[LogDamage], None] | None = None,
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
+    """Yield topic, time [ns] and values of each sample in one of our own logs, in the order of the file.
 
-    on_damage: as of `read_frames`; without it damage is passed over, for one who reads the frames too.
+    Logs in other formats have no samples. start_ns, end_ns, on_damage: see `read_log`; without on_damage nothing is
+    reported, because reading the frames of the same log reports the damage.
     """
-    damage = Damage()
-    if not (own := _own(path, damage)):
-        return
-    for topic, time_ns, text in mcap.samples(*own, damage, start_ns, end_ns):
-        try:
-            values = json.loads(text)
-        except (ValueError, RecursionError):
+    damage = LogDamage(Path(path))
+    own = _own(damage)
+    for message in own.messages() if own else ():
+        topic, time_ns = message.channel.topic, message.published_ns
+        if message.channel.message_encoding != "json":
             continue
-        if isinstance(values, dict):
-            yield topic, time_ns, values
+        if (latest := max(message.logged_ns, time_ns)) >= TIME_LIMIT_NS:
+            damage.add(f"a sample of {topic}", f"{latest} ns is no time")
+        elif (start_ns or 0) <= time_ns < (TIME_LIMIT_NS if end_ns is None else end_ns):
+            with suppress(ValueError, RecursionError):
+                if isinstance(values := json.loads(message.data), dict):
+                    yield topic, time_ns, values
     if damage.count and on_damage:
-        on_damage(LogDamage(Path(path), damage.count, damage.place, damage.reason))
+        on_damage(damage)
 
 
-def _own(path: str | Path, damage: Damage | None = None) -> tuple[Path, Contents] | None:
-    """(path, contents) of a log in our own format; None for other formats. InputError for one that is not there."""
-    path = Path(path)
-    form, data = log_suffix(path), _load(path)
-    return (path, unpacked(path, data, damage or Damage())) if form == ".mcap" else None
+def _own(damage: LogDamage) -> mcap.LogContents | None:
+    """Open a log in our own format; None if it has another. Raises InputError for a missing file."""
+    form, data = log_suffix(damage.path), _load(damage.path)
+    return mcap.LogContents(unpacked(data, damage), damage) if form == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:
@@ -296,55 +316,11 @@ def _load(path: Path) -> Contents:
         raise unreadable(path, error) from None
 
 
-def _filtered(
-    path: Path,
-    reader: Reader,
-    data: Contents,
-    start_ns: int | None,
-    end_ns: int | None,
-    on_damage: Callable[[LogDamage], None],
-) -> Iterator[list[Frame]]:
-    damage = Damage()
-    earliest = start_ns if start_ns is not None else 0
-    latest = end_ns if end_ns is not None else TIME_LIMIT_NS
-    for batch in reader(path, unpacked(path, data, damage), damage, start_ns, end_ns):
-        frames = batch
-        if batch and not _plausible(batch):
-            frames = []
-            for frame in batch:
-                if problem := _problem(frame):
-                    damage.add("a frame", problem)
-                else:
-                    frames.append(frame)
-        if start_ns is not None or end_ns is not None:
-            frames = [frame for frame in frames if earliest <= frame[0] < latest]
-        if frames:
-            yield frames
-    for note in damage.notes:
-        _LOG.warning("%s: %s", path, note)
-    if damage.count:
-        on_damage(LogDamage(path, damage.count, damage.place, damage.reason))
-
-
-def _plausible(batch: list[Frame]) -> bool:
-    """Whether `_problem` finds none in the frames, many times as fast."""
-    times, identifiers, data, _ = zip(*batch, strict=True)
-    standard = (identifier for identifier in set(identifiers) if not identifier & (EFF_FLAG | ERR_FLAG))
-    return (
-        min(times) >= 0
-        and max(times) < TIME_LIMIT_NS
-        and set(map(len, data)) <= FD_LENGTHS
-        and all(identifier & MOST_EXTENDED <= MOST_STANDARD for identifier in standard)
-    )
-
-
 def _problem(frame: Frame) -> str:
-    """What is wrong with a frame that no bus carries; empty if nothing is."""
+    """The reason why no bus carries this frame."""
     time_ns, identifier, data, _ = frame
-    if not 0 <= time_ns < TIME_LIMIT_NS:
+    if time_ns < 0:
         return f"{time_ns} ns is no time"
     if len(data) not in FD_LENGTHS:
         return f"no frame has {len(data)} bytes"
-    if not identifier & (EFF_FLAG | ERR_FLAG) and identifier & MOST_EXTENDED > MOST_STANDARD:
-        return f"identifier {identifier & MOST_EXTENDED:X} has more than 11 bits"
-    return ""
+    return f"identifier {identifier & MOST_EXTENDED:X} has more than 11 bits"

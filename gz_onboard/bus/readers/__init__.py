@@ -1,1 +1,0 @@
-"""Readers of log formats, one file each; `gz_onboard.bus.logs` chooses between them."""

@@ -1,0 +1,121 @@
+"""CAN frames as numpy columns: what every reader of a log returns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, TRANSMITTED, Frame
+
+BATCH = 1000
+"""Frames that `FrameColumns.batches` hands out at once."""
+
+FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
+"""Numbers of data bytes that a frame can have."""
+
+TIME_LIMIT_NS = 1 << 63
+"""Times are from 0 to before this [ns since the epoch], the year 2262: the range of all formats that we write."""
+
+LATEST_NS = TIME_LIMIT_NS - 1
+_NO_TIME = -1
+_HAS_LENGTH = np.array([length in FD_LENGTHS for length in range(256)])
+
+
+@dataclass(frozen=True, eq=False)
+class FrameColumns:
+    """n frames in the order of their log.
+
+    identifier: with the flags of Linux, as in `events.Frame`. data: shape (n, width), the bytes of a frame at the start
+    of its row; those beyond its length have no meaning.
+    """
+
+    time_ns: NDArray[np.int64]
+    identifier: NDArray[np.uint32]
+    channel: NDArray[np.uint8]
+    length: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame]) -> FrameColumns:
+        """Columns of frame tuples; a time beyond 64 bits becomes one that `impossible` reports."""
+        times, identifiers, datas, channels = zip(*frames, strict=True) if frames else ((), (), (), ())
+        width = max(map(len, datas), default=0)
+        return cls(
+            np.array([t if -TIME_LIMIT_NS <= t < TIME_LIMIT_NS else _NO_TIME for t in times], np.int64),
+            np.array(identifiers, np.uint32),
+            np.array(channels, np.uint8),
+            np.array(list(map(len, datas)), np.uint8),
+            np.frombuffer(b"".join([d.ljust(width, b"\0") for d in datas]), np.uint8).reshape(len(frames), width),
+        )
+
+    @classmethod
+    def empty(cls, count: int, width: int) -> FrameColumns:
+        """Zeros for `count` frames of up to `width` bytes, to be filled in."""
+        return cls(
+            np.zeros(count, np.int64),
+            np.zeros(count, np.uint32),
+            np.zeros(count, np.uint8),
+            np.zeros(count, np.uint8),
+            np.zeros((count, width), np.uint8),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[FrameColumns]) -> FrameColumns:
+        """The frames of all parts, one part after the other."""
+        if len(parts) < 2:
+            return parts[0] if parts else cls.of([])
+        whole = cls.empty(sum(map(len, parts)), max(part.data.shape[1] for part in parts))
+        end = 0
+        for part in parts:
+            start, end = end, end + len(part)
+            for name in _SCALARS:
+                getattr(whole, name)[start:end] = getattr(part, name)
+            whole.data[start:end, : part.data.shape[1]] = part.data
+        return whole
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def __getitem__(self, rows: Any) -> FrameColumns:
+        """The frames that a slice, a mask or an array of indices selects."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in (*_SCALARS, "data")})
+
+    @property
+    def bus(self) -> NDArray[np.uint8]:
+        """The channel without the flag of frames that we sent."""
+        return self.channel & ~np.uint8(TRANSMITTED)
+
+    def between(self, start_ns: int | None, end_ns: int | None) -> FrameColumns:
+        """The frames with start_ns <= time < end_ns; None: no limit."""
+        if start_ns is None and end_ns is None:
+            return self
+        low = 0 if start_ns is None else start_ns
+        high = TIME_LIMIT_NS if end_ns is None else end_ns
+        return self[(self.time_ns >= low) & (self.time_ns < high)]
+
+    def impossible(self) -> NDArray[np.bool_]:
+        """Mask of the frames that no bus carries: without a time, of an impossible length or identifier."""
+        standard = self.identifier & (EFF_FLAG | ERR_FLAG) == 0
+        too_wide = standard & (self.identifier & MOST_EXTENDED > MOST_STANDARD)
+        found: NDArray[np.bool_] = (self.time_ns < 0) | ~_HAS_LENGTH[self.length] | too_wide
+        return found
+
+    def tuples(self) -> list[Frame]:
+        """The frames as tuples."""
+        width = max(self.data.shape[1], 1)
+        raw = self.data.tobytes()
+        starts = range(0, width * len(self), width)
+        rows = [raw[at : at + length] for at, length in zip(starts, self.length.tolist(), strict=True)]
+        return list(zip(self.time_ns.tolist(), self.identifier.tolist(), rows, self.channel.tolist(), strict=True))
+
+    def batches(self) -> Iterator[list[Frame]]:
+        """The frames as tuples, in lists of up to `BATCH`."""
+        for start in range(0, len(self), BATCH):
+            yield self[start : start + BATCH].tuples()
+
+
+_SCALARS = ("time_ns", "identifier", "channel", "length")

@@ -1,0 +1,105 @@
+"""A few frames of a log that are stamped ahead of all others do not move time; a gap is a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.bus.codec import AHEAD_NS, BACK_NS, CONFIRM
+from gz_onboard.events import Frame
+from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.timeline import stray
+from tests.support import EPOCH, MS, S
+
+
+def stamped(times: Sequence[int]) -> list[Frame]:
+    """A frame for each time [ms]."""
+    return [(EPOCH + time * MS, 0x100, bytes([number % 256]), 0) for number, time in enumerate(times)]
+
+
+def told_apart(frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
+    """(those kept, those that are odd)."""
+    odd = stray(FrameColumns.of(frames).time_ns).tolist()
+    both = list(zip(frames, odd, strict=True))
+    return [frame for frame, is_odd in both if not is_odd], [frame for frame, is_odd in both if is_odd]
+
+
+@settings(max_examples=60, deadline=None)
+@given(places=st.sets(st.integers(1, 58)), ahead=st.integers(700, 29_900), in_row=st.integers(1, CONFIRM - 1))
+def test_lone_frames_are_odd_wherever_they_are(places, ahead, in_row):
+    frames = stamped([10 * i for i in range(100)])
+    apart = sorted(place for place in places if place % 4 == 0)
+    wrong = [(EPOCH + (10 * i + ahead) * MS, 0x200, bytes([k]), 1) for i in apart for k in range(in_row)]
+    mixed = list(frames)
+    for number, place in reversed(list(enumerate(apart))):
+        mixed[place:place] = wrong[number * in_row : (number + 1) * in_row]
+    assert told_apart(mixed) == (frames, wrong)
+
+
+@given(gaps=st.lists(st.tuples(st.integers(501, 200_000), st.integers(CONFIRM, 30)), max_size=8))
+def test_a_gap_loses_nothing(gaps):
+    times = list(range(0, 300, 10))
+    for gap, count in gaps:
+        times += [times[-1] + gap + 10 * i for i in range(count)]
+    frames = stamped(times)
+    assert told_apart(frames) == (frames, [])
+
+
+@given(times=st.lists(st.integers(0, 60_000), min_size=1, max_size=19))
+def test_where_frames_are_few_none_is_odd(times):
+    frames = stamped(sorted(times))
+    assert told_apart(frames) == (frames, [])
+
+
+def frame_by_frame(times: list[int]) -> list[bool]:
+    """The rule of `stray` in its plainest form."""
+    odd = [False] * len(times)
+    waiting: list[int] = []
+    last, since = -(1 << 80), 0
+    for i, time in enumerate(times):
+        if waiting and -BACK_NS <= time - times[waiting[-1]] <= AHEAD_NS:
+            waiting.append(i)
+            if len(waiting) == CONFIRM:
+                last, since, waiting = time, 0, []
+            continue
+        if waiting and -BACK_NS <= time - last < times[waiting[0]] - last:
+            for k in waiting:
+                odd[k] = True
+        elif waiting:
+            last, since = times[waiting[-1]], 0
+        waiting = []
+        if 500 * MS < time - last <= AHEAD_NS:
+            waiting = [i]
+            continue
+        last, since = (last if -BACK_NS <= time - last < 0 else time), since + 1
+    for k in waiting:
+        odd[k] = since >= 20
+    return odd
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    steps=st.lists(st.one_of(st.integers(-60, 40), st.integers(400, 700), st.integers(-40_000, 40_000)), max_size=80)
+)
+def test_frames_are_judged_together_as_one_by_one(steps):
+    times = [EPOCH + time * MS for time in accumulate(steps)]
+    assert stray(np.array(times, np.int64)).tolist() == frame_by_frame(times)
+
+
+@pytest.mark.parametrize(("last", "odd"), [(9000, 1), (400, 0)])
+def test_a_log_that_comes_all_the_time_does_not_end_in_one_frame_after_a_gap(last, odd):
+    frames = stamped([*range(0, 1000, 10), 990 + last])
+    kept, left_out = told_apart(frames)
+    assert (kept, left_out) == (frames[: len(frames) - odd], frames[len(frames) - odd :])
+
+
+def test_frames_of_two_channels_may_overtake_each_other():
+    frames = stamped([t - 40 * (i % 3 == 2) for i, t in enumerate(range(0, 3000, 15))])
+    assert told_apart(frames) == (frames, [])
+    after = [(time + 9 * S, identifier, data, channel) for time, identifier, data, channel in frames]
+    assert told_apart([*frames, *after]) == ([*frames, *after], [])
