@@ -44,7 +44,7 @@ def test_golden(log):
 def test_both_filters_agree_over_a_whole_ride():
     frames = read_log(SHORTEST)
     scalar, filterpy = golden.estimates(frames), golden.estimates(frames, "filterpy")
-    assert len(scalar) == len(filterpy) > 500
+    assert len(scalar) == len(filterpy) > 100
     for ours, reference in zip(scalar, filterpy, strict=True):
         row, expected = estimate_row(ours), estimate_row(reference)
         for name, value in expected.items():
@@ -71,7 +71,7 @@ def test_the_portions_in_which_frames_arrive_do_not_matter():
     def check(cuts):
         assert estimates(cuts) == expected
 
-    assert len(expected) > 100
+    assert len(expected) > 20
     check()
 
 
