@@ -9,6 +9,7 @@ temperatures, go on with the state of charge (`soc`), learn from the riding and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
@@ -360,6 +361,7 @@ class Estimator:
         ValueError if it does not fit this vehicle; then parts may have been restored: discard this estimator.
         """
         check_snapshot(saved, key)
+        age = age if age is not None and 0 <= age < inf else None  # a clock that was set tells no age
         self.forecaster.restore(saved["riding"])
         self.soc.ageing.restore(saved["learned"])
         self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))

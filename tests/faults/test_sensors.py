@@ -44,9 +44,9 @@ LOSSES: dict[str, tuple[Spoil, Reason, float, str, float, float]] = {
     "inverter current": (absent("INV_Power", "INV_DcCurrent"), Reason.NO_INVERTER_CURRENT, 1.3, "soc", 0.0005, 0.03),
     "currents": (CURRENTS, Reason.NO_PACK_CURRENT | Reason.NO_INVERTER_CURRENT, 1.3, "both", 0.006, 0.06),
     "pack voltage": (absent("BMS_Pack", "BMS_PackVoltage"), Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.001, 0.03),
-    "voltages": (VOLTAGES, Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.002, 0.055),
+    "voltages": (VOLTAGES, Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.002, 0.06),
     "pack": (without("BMS_Pack"), Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
-    "speeds": (SPEEDS, Reason.NO_SPEED, 2.3, "range", 0.0005, 0.055),
+    "speeds": (SPEEDS, Reason.NO_SPEED, 2.3, "range", 0.0005, 0.06),
 }
 
 
