@@ -443,7 +443,7 @@ class ConsumptionLearner:
         pace, pace_variance = habits.pace.ahead(way)
         price, pace = max(price, c.least_price), max(pace, c.least_price)
         extra = self.auxiliaries.mean / speed  # J/m, at the prior's pace
-        consumption = unit * (price + max(stops, 0.0)) + extra * pace
+        consumption = max(unit * (price + max(stops, 0.0)) + extra * pace, c.least_price * unit)
         # Where no grade was seen the price is the model's times the factor, whose error is the same all the way.
         unseen = sums.unseen / sums.distance if sums.distance else 0.0
         price_variance += (unseen * price / self.factor) ** 2 * habits.factor.variance

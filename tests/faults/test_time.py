@@ -54,7 +54,7 @@ def test_one_time_stamp_a_little_ahead_does_no_harm(offset: float):
     run = received((right[0], frame) for right, frame in zip(ride(), frames, strict=True))
     check_sound(run)
     check_timeline(run)
-    check_no_jump(run)
+    check_no_jump(run, soc=0.008)  # as much as a gap of that length leaves unknown
     assert 1 <= sum(n for (_, reason), n in run.faults.items() if reason == TIME) <= 3
     end, true = numbers(run.at(RIDE + offset)), numbers(unspoilt().at(RIDE))
     assert abs(end[0] - true[0]) < min(end[1], 0.01)
@@ -66,7 +66,7 @@ def test_the_clock_is_set_back(step: float):
     first = ride()[0][0]
     frames = [f if f[0] - first < BEGIN * S else (f[0] + round(step * S), *f[1:]) for f in ride()]
     run = ridden(frames)
-    check_all(run)
+    check_all(run, range_=0.015)  # the window in which the clock is set is longer
     assert run.faults == {("", TIME): 2}
     assert run.estimates[-1].time == pytest.approx(RIDE, abs=0.5)
     assert run.at(RIDE).distance == pytest.approx(unspoilt().at(RIDE).distance, abs=1.0)
