@@ -114,7 +114,7 @@ class Pipeline:
             # On a silent bus we say that we are there and have nothing; the grid begins with the first frame.
             self._next_ns = (frames[0][0] if frames else until_ns) + TICK_NS
         out: list[Frame] = []
-        if not -10 * TICK_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
+        if not -WINDOW_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
             self._close_window(self._next_ns)
             begin = frames[0][0] if frames and self._next_ns <= frames[0][0] <= until_ns else until_ns
             self._next_ns -= (self._next_ns - begin) // WINDOW_NS * WINDOW_NS  # on the same grid

@@ -69,7 +69,7 @@ def test_the_clock_is_set_back(step: float):
     check_all(run, range_=0.015)  # the window in which the clock is set is longer
     assert run.faults == {("", TIME): 2}
     assert run.estimates[-1].time == pytest.approx(RIDE, abs=0.5)
-    assert run.at(RIDE).distance == pytest.approx(unspoilt().at(RIDE).distance, abs=1.0)
+    assert run.at(RIDE).distance == pytest.approx(unspoilt().at(RIDE).distance, abs=6.0)  # half a window
 
 
 @pytest.mark.parametrize("step", [40.0, 3600.0, 86400.0 * 365])
