@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from gz_onboard.constants import MILD
+from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES, Port
 from gz_onboard.physics.model import Model, share_that_ages
@@ -14,8 +15,8 @@ FOREVER = 1e9  # s: a rest of unknown length
 FORGOTTEN = 10.0  # s: a current that nobody asked for in so long is followed anew
 
 
-Supposed = tuple[float, float, dict[str, float]]
-"""When [s], the cell's current [A] then, and the states of the effects."""
+Supposed = tuple[float, dict[str, float]]
+"""When [s], and the states of the effects then."""
 
 
 class CellEffects:
@@ -28,6 +29,7 @@ class CellEffects:
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {name: 0.0 for name, _, _ in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
+        self.mean_overpotential = 0.0  # V of a cell, over the last window
         self._supposed: dict[str, Supposed] = {}  # by sensor
 
     def __bool__(self) -> bool:
@@ -42,20 +44,21 @@ class CellEffects:
         q["soc"], q["cell_temperature"] = soc, temperature
         q["cell_capacity"] = self._battery.cell_capacity(temperature)
         self.states = self._after(self.states, dt, current, q)
-        self.overpotential = sum(self.states.values())
+        before, self.overpotential = self.overpotential, sum(self.states.values())
+        self.mean_overpotential = (before + self.overpotential) / 2 if dt <= 2 * WINDOW else self.overpotential
 
     def supposed(self, sensor: str, now: float, current: float) -> float:
-        """`overpotential` [V] at `now` [s] if the cell's `current` [A] by `sensor` flows, not the one that is followed.
+        """`mean_overpotential` [V] at `now` [s] if the cell's `current` [A] by `sensor` flows.
 
         It has its own memory from when it is first asked for: what has just begun has not built up yet, and what has
         long been another is settled.
         """
-        then, before, states = self._supposed.get(sensor, (now, current, self.states))
+        then, states = self._supposed.get(sensor, (now, self.states))
         if not 0 <= now - then < FORGOTTEN:
-            then, before, states = now, current, self.states
-        states = self._after(states, now - then, (before + current) / 2, self._quantities)
-        self._supposed[sensor] = now, current, states
-        return sum(states.values())
+            then, states = now, self.states
+        after = self._after(states, now - then, current, self._quantities)
+        self._supposed[sensor] = now, after
+        return (sum(states.values()) + sum(after.values())) / 2
 
     def _after(
         self, states: Mapping[str, float], dt: float, current: float, quantities: dict[str, float]

@@ -34,6 +34,7 @@ from gz_onboard.estimator.start import (
 )
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
+from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.model import STOOD, Model, standing_load
 
@@ -96,6 +97,7 @@ class StateOfCharge:
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
         self._zero_time = 0.0  # s for which the current has read 0
+        self._v1_lag = 0.0  # V: mean of V1 over the last window less V1 at its end, as voltages are means
         self.another_pack = False  # whether this step has shown it to be another than it was
 
     # --- what others ask --------------------------------------------------------------------------------------
@@ -264,8 +266,9 @@ class StateOfCharge:
             q += self._charge.uncounted(load * dt / charge, sqrt(filter_.covariance[0]))
         if self._own_soc is not None:
             self._own_soc -= mean * dt / charge
-        before = filter_.covariance
+        before, v1 = filter_.covariance, filter_.v1
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
+        self._v1_lag = (v1 - filter_.v1) / 2 if dt <= 2 * WINDOW else 0.0
         self.ageing.count(filter_, before, mean * dt / charge)
         if filter_.covariance[0] > SOC_UNKNOWN_SD**2:
             filter_.covariance = limit_soc_variance(filter_.covariance)
@@ -290,7 +293,7 @@ class StateOfCharge:
         voltage, current = measured
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
         shown = battery.cell_voltage(voltage, current)
-        cell_voltage = shown + self.effects.overpotential
+        cell_voltage = shown + self.effects.mean_overpotential + self._v1_lag
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         drop = r0 * cell_current + self.effects.overpotential

@@ -300,7 +300,7 @@ def test_up_to_five_seconds_between_rows_are_ridden_through(tmp_path):
 @pytest.mark.parametrize("step", [6.0, 20.0])
 def test_what_rows_too_far_apart_leave_out_is_said_and_no_number_is_made_of_it(tmp_path, step):
     ride = steady(tmp_path, step)
-    assert ride["distance_km"] + ride["gaps_s"] / 100 == pytest.approx(6.0, rel=0.02)
+    assert ride["distance_km"] + ride["gaps_s"] / 100 == pytest.approx(6.0, rel=0.05)
     assert (ride["energy_wh"], ride["energy_recovered_wh"], ride["consumption_wh_km"]) == (None, None, None)
     assert (ride["range_end_km"], ride["energy_left_wh"]) == (None, None)
 
