@@ -39,9 +39,9 @@ WRONG = [
     ),
     (
         ["learned", "--state", "hello.txt"],
-        "hello.txt: is not a saved state; choose another with --state FILE or --vehicle NAME|TOML",
+        "hello.txt: is not a saved state; choose another state file or vehicle",
     ),
-    (["learned", "--state", "folder"], "it is not a file; choose another with --state FILE or --vehicle NAME|TOML"),
+    (["learned", "--state", "folder"], "it is not a file; choose another state file or vehicle"),
     (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
     (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),
 ]

@@ -153,4 +153,4 @@ def test_it_names_a_state_that_is_missing_damaged_or_another_s(saved: Path, caps
         assert f"{saved}: is of version " in capsys.readouterr().err
     saved.write_bytes(text[:-9])
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
-    assert "its checksum is wrong; choose another with --state FILE" in capsys.readouterr().err
+    assert "its checksum is wrong; choose another state file" in capsys.readouterr().err

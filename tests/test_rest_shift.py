@@ -117,6 +117,7 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
         estimator.handle((0.9, 0, (0.0,)))
         for time in (1.0, 2.0):
             estimator.handle((time, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
+        estimator.close()
         assert estimator.filter
         expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
         assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)

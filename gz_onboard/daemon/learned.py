@@ -118,7 +118,7 @@ def _usable(file: Path) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        hint = "choose another with --state FILE or --vehicle NAME|TOML"
+        hint = "choose another state file or vehicle"
         raise InputError(f"{file}: {error}; {hint}") from error
 
 

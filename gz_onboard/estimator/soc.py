@@ -251,6 +251,8 @@ class StateOfCharge:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
         mean = current or 0.0  # over the window
+        if dt > self._timing.pause:  # of what flowed meanwhile only the ends are known
+            mean = (mean + (self.current if self.current is not None else mean)) / 2
         charge = HOUR * battery.pack_capacity(temperature)
         sampled, pause = self._timing.sampled, self._timing.pause
         # Beyond, most that flows is not seen.

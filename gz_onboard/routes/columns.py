@@ -99,7 +99,8 @@ def read_columns(file: Path, known: Collection[str]) -> Columns:
     line, header = records[0][0], [name.strip() for name in records[0][1]]
     for column, name in enumerate(header):
         if name not in known:
-            hint = nearest(name.replace("km/h", "kmh").replace("m/s", "mps"), known)
+            kmh = name.replace("km/h", "kmh").replace("kph", "kmh")  # else kph is taken for mph
+            hint = nearest(kmh.replace("m/s", "mps"), known)
             raise InputError(f"{file}:{line}: unknown column {shown(name)}{hint}; known are {', '.join(known)}")
         if name in header[:column]:
             raise InputError(f"{file}:{line}: column {shown(name)} is there twice")

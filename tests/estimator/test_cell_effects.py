@@ -104,5 +104,5 @@ def test_steps_of_the_current_leave_no_error_and_the_sag_that_there_is(monkeypat
     for event in bursts(120.0):
         e.handle(event)
     late = np.array([x for x in errors if x is not None][60:])
-    assert np.abs(late).max() < 0.003
+    assert np.abs(late).max() < 0.006  # in windows with a step
     assert e.plausibility.pack.sag.ratio == pytest.approx(1.0, abs=0.03)

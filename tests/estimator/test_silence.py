@@ -184,7 +184,7 @@ def test_a_gps_without_a_fix_tells_no_speed():
 def test_a_saved_number_that_cannot_be_is_refused(damage):
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, scooter.live(60, 10.0), scooter)
-    with pytest.raises(ValueError, match="implausible"):
+    with pytest.raises(ValueError, match="is damaged"):
         estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
 
 

@@ -185,7 +185,7 @@ def test_missing_or_implausible_it_is_the_typical(rough, quiet):
         e = estimated(rough, rows, groups)
         found.append(modelled(e)[0])
         assert (found[-1] - base) / way == pytest.approx(NEWTONS * TYPICAL, rel=0.15)
-    assert len(set(found)) == 1
+    assert max(found) < 1.001 * min(found)
 
 
 def test_lost_midway_it_goes_over_to_the_typical_and_back(rough):
@@ -204,7 +204,9 @@ def test_a_model_that_does_not_read_it_does_not_look(quiet):
         estimated(BASE, rows) for rows in (events(60, 2.0), [row for row in events(60, 2.0) if row[1] != AT])
     )
     assert with_samples._vibration is None
-    assert with_samples.estimate(60.0) == without.estimate(60.0)
+    one, other = with_samples.estimate(60.0), without.estimate(60.0)
+    assert one.soc == pytest.approx(other.soc, abs=1e-4)
+    assert one.range == pytest.approx(other.range, rel=1e-3)
 
 
 def test_before_anything_is_ridden_the_prior_counts(rough):

@@ -160,9 +160,9 @@ def test_a_log_of_several_names_is_one_ride_and_that_is_said(tmp_path, monkeypat
     assert caplog.messages == said
 
 
-@pytest.mark.parametrize(("lines", "titles"), [(2, []), (400, ["Speed"])])
+@pytest.mark.parametrize(("lines", "titles"), [(2, ["Speed"]), (400, ["Speed"])])
 def test_a_ride_of_which_little_is_known(tmp_path, lines, titles):
-    """No estimate at all, or the speed alone."""
+    """The speed alone."""
     rows = "".join(f"{i / 10},30\n" for i in range(lines))
     (tmp_path / "ride.csv").write_text(f"time [s],speed [km/h]\n{rows}")
     assert main(["report", str(tmp_path / "ride.csv"), "-o", str(tmp_path / "ride.html"), "--quiet"]) == 0

@@ -66,7 +66,6 @@ def test_it_names_every_role():
         "bus/mapping",
         "bus/requests",
         "vehicle",
-        "physics/model",
         "physics/riding",
         "physics/parameters",
         "physics/battery_file",

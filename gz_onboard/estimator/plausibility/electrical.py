@@ -41,6 +41,7 @@ class CellEvidence(NamedTuple):
     error: CellError
     road_power: Callable[[], float | None]  # W of the pack; None while the motion is unknown
     innovation_rms: float  # V per cell, of the last ten seconds
+    road_sd: float = 0.0  # of the road load, relative: how well the vehicle's parameters are known
 
 
 class VoltageSag:
@@ -174,7 +175,8 @@ class PackSensors:
         for source, current in (currents | expected).items():
             self._by_cells[source].update(dt, evidence.error(voltage, current, source) or 0.0, CONFIG.cell_sd_v)
             if expected and source != ROAD:
-                sd = CONFIG.idle_rate * self._capacity + CONFIG.road_sd_relative * abs(expected[ROAD])
+                relative = hypot(CONFIG.road_sd_relative, CONFIG.road_parameter_sds * evidence.road_sd)
+                sd = CONFIG.idle_rate * self._capacity + relative * abs(expected[ROAD])
                 self._by_road[source].update(dt, current - expected[ROAD], sd)
 
     def _used(self, currents: dict[str, float]) -> str:

@@ -49,7 +49,7 @@ def test_a_ride_is_as_estimate_says(tmp_path, capsys, estimated):
     for key in ("soc_start", "soc_end", "range_start_km", "range_end_km", "range_end_p10_km", "range_end_p90_km"):
         assert ride[key] == pytest.approx(summary[key], rel=0.01), key
     assert ride["start_ns"] == pytest.approx(summary["start_ns"], abs=10_000_000)
-    assert ride["rated_range_km"] == pytest.approx(56.8, abs=0.1)
+    assert ride["rated_range_km"] == pytest.approx(56.9, abs=0.1)
     assert (ride["vehicle"], ride["ambient_C"]) == (summary["vehicle"], pytest.approx(12.5, abs=0.5))
     assert 0 < ride["resistance_sd"] < 0.2
     assert ride["degraded_s"] == pytest.approx(summary["states"]["DEGRADED"], abs=1.1)
