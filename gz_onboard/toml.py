@@ -21,7 +21,7 @@ FEW = 30  # names that a message lists
 _HEADER = re.compile(r"[ \t]*(\[\[?)[ \t]*([A-Za-z_\"'][^\[\],]*)\]+[ \t]*(?:#.*)?$")
 _KEY = re.compile(r"[ \t]*([\w\"'-][\w\"'. \t-]{0,200})=")
 # The time to read a key grows with the square of its parts; four are the most in use.
-_DEEP_KEY = re.compile(r"(?:[\w-]++[ \t]*+\.[ \t]*+){20}")
+_DEEP_KEY = re.compile(r"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){20}")  # from the beginning of a word only
 
 
 SMALLEST_STEP = 1e-6

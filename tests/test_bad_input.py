@@ -37,10 +37,7 @@ WRONG = [
         ["learned", "--state", "none.json"],
         "none.json: no saved state; the daemon keeps one in its state folder; choose another",
     ),
-    (
-        ["learned", "--state", "hello.txt"],
-        "hello.txt: is not a saved state; choose another state file or vehicle",
-    ),
+    (["learned", "--state", "hello.txt"], "hello.txt: is not a saved state; choose another state file or vehicle"),
     (["learned", "--state", "folder"], "it is not a file; choose another state file or vehicle"),
     (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
     (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),
