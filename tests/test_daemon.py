@@ -431,7 +431,7 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
     caplog.set_level(logging.INFO)
     (tmp_path / "file").write_text("in the way")
     with Scene(bus, state_file=tmp_path / "file" / "state" / "scooter.json") as scene:
-        scene.ride(1.0)
+        scene.ride(3.0)
         assert scene.daemon._keeper is not None
         scene.daemon._keeper.save(scene.daemon.pipeline, time.time_ns())
         last = scene.daemon.pipeline.last

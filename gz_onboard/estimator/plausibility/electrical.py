@@ -164,7 +164,7 @@ class PackSensors:
         doubted, used = differ, self._used(currents)
         if voltage and used and not charging:  # no road charges a pack
             error = abs(evidence.error(voltage, currents[used], used) or 0.0)
-            unexplained = not self.sag.explained and evidence.innovation_rms > CONFIG.cell_sd_v
+            unexplained = not self.sag.explained and evidence.innovation_rms > CONFIG.suspicious_cell_rms_v
             doubted |= unexplained or error > CONFIG.gross_cell_error_v
         if not doubted or not voltage:
             for test in (*(self._by_cells[source] for source in (*self._by_road, ROAD)), *self._by_road.values()):
