@@ -158,7 +158,9 @@ def test_it_is_as_of_a_daemon_that_is_restarted(kept, cuts, tmp_path, monkeypatc
     assert estimate(tmp_path, log) == 0
     same(snapshot(file), snapshot(kept / "s.previous.json"))
     by_the_daemon(cuts["c"], file, monkeypatch)
-    same(snapshot(file), snapshot(kept / "s.json"))
+    one, other = snapshot(file), snapshot(kept / "s.json")  # windows of the third begin elsewhere
+    assert one["soc"] == pytest.approx(other["soc"], abs=1e-3)
+    assert one["consumption"] == pytest.approx(other["consumption"], rel=0.01)
     monkeypatch.undo()
     assert snapshot(kept / "s.json")["soc"] != pytest.approx(snapshot(kept / "s.previous.json")["soc"], rel=1e-6)
 
