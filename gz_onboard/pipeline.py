@@ -112,7 +112,7 @@ class Pipeline:
         """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
         if self._next_ns is None or (frames and not self.codec.started):
             # On a silent bus we say that we are there and have nothing; the grid begins with the first frame.
-            self._next_ns = (frames[0][0] if frames else until_ns) + TICK_NS
+            self._next_ns, self._ticks = (frames[0][0] if frames else until_ns) + TICK_NS, 0
         out: list[Frame] = []
         if not -WINDOW_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
             self._close_window(self._next_ns)

@@ -189,7 +189,7 @@ class Estimator:
         def error(voltage: float, current: float, sensor: str) -> float | None:
             return self.soc.cell_error(now, (voltage, current), sensor, cells)
 
-        evidence = CellEvidence(error, road_power, self.soc.gate.rms, self.forecaster.load.prior.factor_sd)
+        evidence = CellEvidence(error, road_power, self.soc.gate.rms)
         reading = self.plausibility.pack.read(now, dt, self.motion.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed

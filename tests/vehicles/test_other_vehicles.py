@@ -101,7 +101,7 @@ def test_tlmoto_goes_the_whole_way():
     pipeline = Pipeline(vehicle("tlmoto"))
     sent = []
     for i in range(600):
-        amps = 60.0 if i > 50 else 0.0
+        amps = 20.0 if i > 50 else 0.0
         frames = tlmoto_frames(i * 200 * MS, 2500 if i > 50 else 0, 116.0 - 0.033 * amps, amps)
         sent += pipeline.advance(frames, frames[-1][0])
     estimate = pipeline.last

@@ -41,7 +41,6 @@ class CellEvidence(NamedTuple):
     error: CellError
     road_power: Callable[[], float | None]  # W of the pack; None while the motion is unknown
     innovation_rms: float  # V per cell, of the last ten seconds
-    road_sd: float = 0.0  # of the road load, relative: how well the vehicle's parameters are known
 
 
 class VoltageSag:
@@ -164,7 +163,7 @@ class PackSensors:
         doubted, used = differ, self._used(currents)
         if voltage and used and not charging:  # no road charges a pack
             error = abs(evidence.error(voltage, currents[used], used) or 0.0)
-            unexplained = not self.sag.explained and evidence.innovation_rms > CONFIG.suspicious_cell_rms_v
+            unexplained = not self.sag.explained and evidence.innovation_rms > CONFIG.cell_sd_v
             doubted |= unexplained or error > CONFIG.gross_cell_error_v
         if not doubted or not voltage:
             for test in (*(self._by_cells[source] for source in (*self._by_road, ROAD)), *self._by_road.values()):
@@ -175,8 +174,7 @@ class PackSensors:
         for source, current in (currents | expected).items():
             self._by_cells[source].update(dt, evidence.error(voltage, current, source) or 0.0, CONFIG.cell_sd_v)
             if expected and source != ROAD:
-                relative = hypot(CONFIG.road_sd_relative, CONFIG.road_parameter_sds * evidence.road_sd)
-                sd = CONFIG.idle_rate * self._capacity + relative * abs(expected[ROAD])
+                sd = CONFIG.idle_rate * self._capacity + CONFIG.road_sd_relative * abs(expected[ROAD])
                 self._by_road[source].update(dt, current - expected[ROAD], sd)
 
     def _used(self, currents: dict[str, float]) -> str:

@@ -64,9 +64,7 @@ class PlausibilityConfig:
     current_sd_relative: float = 0.10
     current_offset_time_s: float = 300.0  # over which a lasting difference of the two is measured
     road_sd_relative: float = 0.7  # of the current by the road load; wind, payload and slip
-    road_parameter_sds: float = 4.0  # so many sd of the vehicle's parameters are allowed for as well
     cell_sd_v: float = 0.031  # per cell, of the cell model
-    suspicious_cell_rms_v: float = 0.04  # per cell, over ten seconds; below, the currents are not doubted
     gross_cell_error_v: float = 0.4  # per cell; no healthy current makes such an error
 
     # Voltages per cell.
