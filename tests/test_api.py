@@ -538,7 +538,7 @@ def test_what_was_learned_is_that_of_the_command(saved, capsys):
         "no saved state": None,
         "is not a saved state": b"hello",
         "its checksum is wrong": whole[:-9],
-        "is of 'car', this is": state.encode({**snapshot, "key": "car"}, time.time()),
+        "is of another vehicle": state.encode({**snapshot, "key": "car"}, time.time()),
         "is damaged: state.riding ": state.encode({**snapshot, "riding": {}}, time.time()),
     }
     for said, text in refused.items():
