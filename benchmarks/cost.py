@@ -28,7 +28,6 @@ PARTS = {
 
 def pipeline() -> dict[str, float]:
     """µs a frame of a recorded ride: from decoder to range frames in portions of 0.1 s; from log to columns."""
-    from gz_onboard.offline.samples import read_samples
     from gz_onboard.pipeline import Pipeline
     from gz_onboard.vehicle import read_vehicle
 
@@ -41,13 +40,12 @@ def pipeline() -> dict[str, float]:
         for frames, until in portions:
             run.advance(frames, until)
 
-    def columns() -> None:
-        read_samples(RIDE, vehicle)
+    found = {"pipeline, live path": 1e6 * _best(ride) / number}
+    with contextlib.suppress(ImportError):
+        from gz_onboard.offline.samples import read_samples
 
-    return {
-        "pipeline, live path": 1e6 * _best(ride) / number,
-        "log to columns of signals": 1e6 * _best(columns) / number,
-    }
+        found["log to columns of signals"] = 1e6 * _best(lambda: read_samples(RIDE, vehicle)) / number
+    return found
 
 
 def _frames() -> list[Any]:
