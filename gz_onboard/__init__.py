@@ -101,9 +101,9 @@ if not TYPE_CHECKING:  # to which a name that is none is a mistake
         try:
             from gz_onboard import api
         except ModuleNotFoundError as error:
-            from gz_onboard.errors import lacking_extra
+            from gz_onboard.imports import missing_extra
 
-            if not (missing := lacking_extra(error)):
+            if not (missing := missing_extra(error)):
                 raise
             raise ImportError(f"gz_onboard.{name} {missing}", name=error.name) from error
 

@@ -13,17 +13,8 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import (
-    BAD_INPUT,
-    EXIT_STATUSES,
-    FAILED,
-    INTERRUPTED,
-    InputError,
-    closest,
-    lacking_extra,
-    naming,
-    nearest,
-)
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, closest, naming, nearest
+from gz_onboard.imports import missing_extra
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
@@ -146,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _drop_output()
         return BAD_INPUT
     except ModuleNotFoundError as error:
-        if not (missing := lacking_extra(error)):
+        if not (missing := missing_extra(error)):
             raise
         print(f"gz-onboard {called}: {missing}", file=sys.stderr)
         return BAD_INPUT

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import errno
-import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +18,6 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
-_PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # that are not named as their modules
 _NAMES_REFUSED = (errno.ENAMETOOLONG, errno.EACCES)
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
@@ -36,31 +34,6 @@ class InputError(Exception):
     The message names the place (file, line, key), the value with its unit, and the values that would be
     right. The command line prints it without a traceback and exits with status `BAD_INPUT`.
     """
-
-
-def require(module: str, wanted: bool = True) -> None:
-    """ModuleNotFoundError for a `module` of an extra that is not installed, before the work that would end in it."""
-    from importlib.util import find_spec
-
-    if wanted and find_spec(module) is None:
-        raise ModuleNotFoundError(f"no module named {module!r}", name=module)
-
-
-def lacking_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install for a module that is missing, if it is of an extra of this package; None if of none."""
-    from importlib.metadata import PackageNotFoundError, requires
-
-    module = (error.name or "").partition(".")[0]
-    package = _PACKAGES.get(module, module)
-    try:
-        needed = requires("gz-onboard") or []
-    except PackageNotFoundError:
-        return None
-    for requirement in needed:
-        found = re.fullmatch(r"([\w-]+).*;.*\bextra == ['\"](\w+)['\"].*", requirement)
-        if found and found[1].replace("-", "_").lower() == package.replace("-", "_").lower():
-            return f"needs {package}, which is not installed: pip install 'gz-onboard[{found[2]}]'"
-    return None
 
 
 def nearest(name: str, known: Iterable[str], close: float | None = None) -> str:

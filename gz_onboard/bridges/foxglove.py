@@ -16,8 +16,9 @@ from gz_onboard.dashboard.command import add_source, channel_of, view_of
 from gz_onboard.dashboard.picture import Picture
 from gz_onboard.dashboard.pictures import pictures, until_signalled
 from gz_onboard.dashboard.server import host_and_port
-from gz_onboard.errors import OK, InputError, require, writing
+from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Frame, RouteState
+from gz_onboard.imports import require
 from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
 from gz_onboard.vehicle import read_vehicle

@@ -17,7 +17,8 @@ from gz_onboard.dashboard.command import add_source, channel_of, view_of
 from gz_onboard.dashboard.picture import Picture, picture
 from gz_onboard.dashboard.pictures import clock, pictures, until_signalled
 from gz_onboard.dashboard.view import View
-from gz_onboard.errors import OK, InputError, require
+from gz_onboard.errors import OK, InputError
+from gz_onboard.imports import require
 
 if TYPE_CHECKING:
     from gz_onboard.bridges.broker import Broker

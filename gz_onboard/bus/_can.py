@@ -12,8 +12,9 @@ import socket
 import sys
 from typing import Any
 
-from gz_onboard.errors import InputError, nearest, require
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG
+from gz_onboard.imports import require
 
 
 def _import_without_asammdf() -> None:

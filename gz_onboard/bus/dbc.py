@@ -9,11 +9,11 @@ import sys
 from collections.abc import Collection, Sequence
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import EFF_FLAG, MOST_EXTENDED, MOST_STANDARD
+from gz_onboard.imports import without
 from gz_onboard.toml import is_file, read_text
 
 if TYPE_CHECKING:
@@ -38,6 +38,16 @@ _DECIDES_OTHERS = re.compile(r"\s*(SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_)")  # with
 MOST_BROKEN = 20  # lines: a file with more is not DBC
 MOST_SAID = 5  # problems in one warning
 
+_FORMATS = "cantools.database.can.formats"
+_UNUSED = (
+    "cantools.tester",  # imports python-can: 9 MB
+    "cantools.logreader",
+    "cantools.database.diagnostics",
+    *(f"{_FORMATS}.{other}" for other in ("arxml", "arxml.node_specifics", "kcd", "sym")),
+    "importlib.metadata",
+)
+"""Parts of cantools that DBC files do not need: half of its import."""
+
 _LOG = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -59,13 +69,11 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
 def empty_database(strict: bool = True) -> Database:
     """A cantools database, to which DBC files are added; `strict`: signals must fit and may not overlap."""
     logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
-    hidden = {"cantools.tester": ModuleType("cantools.tester")} if "cantools" not in sys.modules else {}
-    sys.modules.update(hidden)  # it imports python-can: 9 MB, and a fifth of the daemon's start
-    try:
+    if "cantools" in sys.modules:
         from cantools.database.can import Database
-    finally:
-        for name in hidden:
-            del sys.modules[name]
+    else:
+        with without(*_UNUSED):
+            from cantools.database.can import Database
     return Database(strict=strict)
 
 

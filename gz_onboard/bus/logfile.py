@@ -11,17 +11,20 @@ from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, TypeAlias
 
-from mcap.writer import CompressionType, Writer
-
 from gz_onboard import __version__
 from gz_onboard.bus import framelog
 from gz_onboard.errors import writable
 from gz_onboard.events import Frame
+from gz_onboard.imports import without
+
+with without("importlib.metadata", "lz4", "lz4.frame"):  # the first costs more than all the rest of mcap
+    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 BLOCK_FRAMES = 512
 BLOCK_NS = 1_000_000_000
 """A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
 
+MAGIC = MCAP0_MAGIC
 _CHUNK_BYTES = 256 * 1024
 _encode = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode  # `dumps` would make it anew each time
 _Sample: TypeAlias = tuple[int, int, bytes, int]  # log time [ns], channel, data, time of publishing [ns]

@@ -10,12 +10,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.dbc import database_of, find_dbc, read_dbc
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
@@ -215,8 +215,13 @@ def range_messages(file: Path) -> dict[str, Message]:
     InputError for a message or signal of ``dbc/range.dbc`` that is missing or cannot be sent.
     """
     own = find_dbc(RANGE_DBC)
-    standard = load_database([own])
-    found = {message.name: message for message in (standard if file == own else load_database([file])).messages}
+    return _range_messages(file, read_dbc(file), own, read_dbc(own))
+
+
+@cache  # a vehicle makes several publishers
+def _range_messages(file: Path, text: str, own: Path, own_text: str) -> dict[str, Message]:
+    standard = database_of([(own, own_text)])
+    found = {message.name: message for message in (standard if file == own else database_of([(file, text)])).messages}
     for wanted in standard.messages:
         if wanted.name not in found:
             near = nearest(wanted.name, found)

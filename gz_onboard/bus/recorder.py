@@ -17,9 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-from mcap.writer import MCAP0_MAGIC
-
-from gz_onboard.bus.logfile import LogFile
+from gz_onboard.bus.logfile import MAGIC, LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 from gz_onboard.state import sync_directory
@@ -248,8 +246,8 @@ def is_complete(path: Path) -> bool:
     """Whether the log was closed, and not cut off. OSError if it cannot be read."""
     with path.open("rb") as stream:
         size = stream.seek(0, os.SEEK_END)
-        stream.seek(max(size - len(MCAP0_MAGIC), 0))
-        return size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
+        stream.seek(max(size - len(MAGIC), 0))
+        return size > 2 * len(MAGIC) and stream.read() == MAGIC
 
 
 def lock(stream: IO[bytes]) -> bool:

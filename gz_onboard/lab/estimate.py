@@ -15,8 +15,9 @@ from pathlib import Path
 
 from gz_onboard import state
 from gz_onboard.constants import HOUR
-from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import Reason, words
+from gz_onboard.imports import require
 from gz_onboard.lab.estimate_log import EstimateTask, estimate_log, kept_in_turn
 from gz_onboard.lab.estimate_order import Unread, in_order
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate

@@ -7,8 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_type_hints
 
-from gz_onboard.errors import InputError, nearest, require, writing
+from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import State
+from gz_onboard.imports import require
 from gz_onboard.lab.estimate_summary import RideSummary
 from gz_onboard.offline.results import Failure
 from gz_onboard.recording.tables import write_table

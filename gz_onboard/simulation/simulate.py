@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.constants import HOUR, WH_PER_KM
-from gz_onboard.errors import OK, InputError, not_an_input, require
+from gz_onboard.errors import OK, InputError, not_an_input
+from gz_onboard.imports import require
 from gz_onboard.offline.results import times, write_json
 from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar

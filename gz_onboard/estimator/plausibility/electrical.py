@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import hypot, inf, isinf, sqrt
-from statistics import fmean
 from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE
@@ -203,7 +202,7 @@ class PackSensors:
             self.counters[role].update(dt, True if role in against else agree, disputed)
             self._signals[role].trusted = not self.counters[role].faulty and (disputed or role not in against)
         if disputed:
-            return fmean(currents.values()), CurrentSource.DISPUTED
+            return sum(currents.values()) / len(currents), CurrentSource.DISPUTED
         if "inverter_current" in currents and not self._signals.auxiliary_current.trusted:
             currents["inverter_current"] -= extra
         if comparable and not against | known:
@@ -244,7 +243,7 @@ class PackSensors:
             self.counters[role].update(dt, True if role in against else agree if role in cells else None, disputed)
             self._signals[role].trusted = disputed or not (role in against or self.counters[role].faulty)
         if disputed:
-            return fmean(voltages.values())
+            return sum(voltages.values()) / len(voltages)
         return next((voltage for role, voltage in voltages.items() if self._signals[role].trusted), None)
 
     def _compare_voltages(self, dt: float, pack: float, inverter: float) -> bool:

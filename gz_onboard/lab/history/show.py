@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, get_args
 
-from gz_onboard.errors import OK, InputError, not_an_input, require, writing
+from gz_onboard.errors import OK, InputError, not_an_input, writing
+from gz_onboard.imports import require
 from gz_onboard.lab.estimate_table import FORMATS, check_table
 from gz_onboard.lab.history.choice import Choice, period, read_rides
 from gz_onboard.lab.history.picture import draw_history
