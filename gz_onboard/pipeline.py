@@ -15,7 +15,7 @@ from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.estimator import reasons
+from gz_onboard.estimator import signals
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.estimator import Estimator
@@ -297,7 +297,7 @@ def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:
 
 def lacking(vehicle: Vehicle) -> list[str]:
     """The reasons that would always be there, were they told: for sensors that the vehicle does not have."""
-    return reason_names(reasons.lacking({source.role for source in vehicle.mapping.sources}))
+    return reason_names(signals.lacking({source.role for source in vehicle.mapping.sources}))
 
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import WINDOW, Estimate, Frame, MessageWindow, RoleWindow
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import STALE_PERIODS, WINDOW, Estimate, Frame, Group, MessageWindow, RoleWindow
 
 Event: TypeAlias = tuple[float, int, tuple[float | None, ...]]
 """(time [s], group, values in SI units)"""
@@ -59,3 +60,16 @@ class EventEstimator(Estimator):
             n = len(seen)
             roles.append(RoleWindow(*seen[-1], n, sum(values) / n, sum(v * v for v in values) / n) if seen else None)
         return MessageWindow(group, events[-1][0], len(events), tuple(roles))
+
+
+class ShownSignals(Signals):
+    """Signals of one message for each role, stale after `stale` [s]."""
+
+    def __init__(self, *roles: str, stale: float = 2.0) -> None:
+        super().__init__([Group(role, (role,), stale / STALE_PERIODS) for role in roles])
+        self._roles = roles
+
+    def show(self, now: float, values: Mapping[str, float | None]) -> None:
+        """Take one sample of each of these roles at `now` [s]; None: nothing comes."""
+        shown = [(self._roles.index(role), value) for role, value in values.items() if value is not None]
+        self.take([MessageWindow(i, now, 1, (RoleWindow(now, value, 1, value),)) for i, value in shown], now)

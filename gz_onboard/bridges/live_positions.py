@@ -7,8 +7,8 @@ from typing import Any
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.layout import identifiers_of
-from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.events import STALE_PERIODS, Frame
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import Frame
 from gz_onboard.log_rows import Positions
 from gz_onboard.vehicle import Vehicle
 
@@ -24,11 +24,7 @@ class LivePositions:
         mapped = {source.role: source.message for source in mapping.sources if source.role in ROLES}
         self.identifiers = identifiers_of(mapping, set(mapped.values()))
         self._codec = Codec(mapping)
-        self._signals = Signals(
-            (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
-            for group in self._codec.groups
-            for role in group.roles
-        )
+        self._signals = Signals(self._codec.groups)
         self._positions = Positions()
 
     @staticmethod
@@ -42,9 +38,7 @@ class LivePositions:
         codec, signals = self._codec, self._signals
         for frame in frames:
             codec.decode([frame])
-            for window in codec.windows():
-                for role, samples in zip(codec.groups[window.group].roles, window.roles, strict=True):
-                    if samples is not None:
-                        signals[role].take(samples)
-            if found := self._positions.new(signals, codec.seconds(frame[0]), frame[0]):
+            now = codec.seconds(frame[0])
+            signals.take(codec.windows(), now)
+            if found := self._positions.new(signals, now, frame[0]):
                 yield found[1]

@@ -21,28 +21,15 @@ from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.plausibility import Plausibility
 from gz_onboard.estimator.plausibility.electrical import CellEvidence
 from gz_onboard.estimator.plausibility.residual import StepInputs
-from gz_onboard.estimator.reasons import DEGRADING, MissingSignals, loss_variance
 from gz_onboard.estimator.route import RouteForecaster
-from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
+from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.snapshot import VERSION, check_snapshot
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState
 from gz_onboard.estimator.start import read_saved
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
-from gz_onboard.estimator.timing import COARSE, SLOWEST, MessageTiming
 from gz_onboard.estimator.weakest import WeakestGroup
-from gz_onboard.events import (
-    NO_PACK,
-    SPEEDS,
-    STALE_PERIODS,
-    WINDOW,
-    Activity,
-    Estimate,
-    Group,
-    MessageWindow,
-    Reason,
-    State,
-)
+from gz_onboard.events import NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model
@@ -57,6 +44,20 @@ LEAP = 30.0  # s: the odometer shows whether a longer step of time was a gap, or
 ODOMETER_WITHIN = 3.0  # s to wait for the odometer after such a step
 CELLS_KEEP = 3600.0  # s: saved cell temperatures that are older say nothing
 NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
+LOSS_SD = {  # relative, of the consumption to come for what is missing, from the errors on the rides without each
+    Reason.NO_SPEED: 0.10,
+    Reason.NO_IMU: 0.03,
+    Reason.NO_GPS: 0.03,
+    Reason.NO_AMBIENT_TEMPERATURE: 0.04,
+    Reason.NO_CELL_TEMPERATURE: 0.02,
+    Reason.NO_PACK_CURRENT: 0.03,
+    Reason.NO_PACK_VOLTAGE: 0.02,
+    Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
+}
+# Plain integers, as operations on flags are slow: (bit, variance), and the reasons that degrade an estimate.
+_LOSS_VARIANCES = [(int(reason), sd * sd) for reason, sd in LOSS_SD.items()]
+_DEGRADING = ~int(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)
+_NO_PACK = int(NO_PACK)
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
 
@@ -73,19 +74,11 @@ class Estimator:
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
         self.motion, self.forecaster = Motion(), Forecaster(model, battery, riding)
-        stale = [(role, group.period) for group in groups for role in group.roles]
-        self.signals = Signals(
-            ((role, STALE_PERIODS * period if period else DEFAULT_STALE) for role, period in stale),
-            battery.window.of_cells,
-        )
+        self.signals = Signals(groups, battery.window.of_cells)
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
         self.explainer = RangeExplainer(self.forecaster, self.signals)
         self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
-        self._missing = MissingSignals(self.signals)
-        self._slots = [[self.signals[role] for role in group.roles] for group in groups]
-        self._timing = MessageTiming(groups, self._slots)
-        self._speeds = _carrying(SPEEDS, groups)[:1]
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
@@ -99,7 +92,7 @@ class Estimator:
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
         self.plausibility = Plausibility(self.signals, battery, p, model.mass)
         self._temperatures = Temperatures(self.signals, p)
-        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.plausibility.pack.sag)
+        self.soc = StateOfCharge(battery, model, make, self.signals, self.plausibility.pack.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
         self._inputs = ModelInputs(self.forecaster, self.motion, self._temperatures, self.soc, self._vibration)
 
@@ -123,13 +116,8 @@ class Estimator:
         if not windows:
             return
         now = max(self._time or 0.0, *(window.time for window in windows))
-        for window in windows:
-            self._timing.take(window)
-            for signal, samples in zip(self._slots[window.group], window.roles, strict=True):
-                if samples is not None:
-                    signal.take(samples)
+        self.signals.take(windows, now)
         self._advance(now)
-        self.signals.next_window()
 
     def _advance(self, now: float) -> None:
         dt = self._elapsed(now)
@@ -137,7 +125,7 @@ class Estimator:
             return
         self._time = now
         signals, motion = self.signals, self.motion
-        elapsed = min(dt, self._timing.pause)
+        elapsed = min(dt, self.signals.pause)
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
@@ -145,7 +133,7 @@ class Estimator:
         motion.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
-        temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self._timing.pause else at_rest)
+        temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self.signals.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._inputs)
         self.weakest.step(now, self._reading, temperature, self.soc)
@@ -183,7 +171,7 @@ class Estimator:
         cells = self._temperatures.cells_or_bench
 
         def road_power() -> float | None:
-            known = self.motion.speed is not None and self._timing.sampled <= COARSE
+            known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
             return self._inputs.power(now) if known else None
 
         def error(voltage: float, current: float, sensor: str) -> float | None:
@@ -194,7 +182,7 @@ class Estimator:
         self.soc.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
-        rides = speed is not None and abs(speed) > MOVING and dt < self._timing.pause
+        rides = speed is not None and abs(speed) > MOVING and dt < self.signals.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.soc.rest_voltage
             return reading._replace(current=self._inputs.power(now) / voltage, source=CurrentSource.MODEL)
@@ -240,15 +228,15 @@ class Estimator:
         self._activity.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
-        self.forecaster.learner.auxiliaries.step(min(dt, self._timing.pause), measured)
+        self.forecaster.learner.auxiliaries.step(min(dt, self.signals.pause), measured)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
         speed, reading = self.motion.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.plausibility.speeds.disputed
-        known = 0 < dt <= self._timing.pause and not unsure and self._activity.teaches
+        known = 0 < dt <= self.signals.pause and not unsure and self._activity.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
-            still = 0.0 if dt <= self._timing.pause and self._activity.now is Activity.RIDING else dt
+            still = 0.0 if dt <= self.signals.pause and self._activity.now is Activity.RIDING else dt
             self.forecaster.learner.pause(still)
             return
         power = reading.voltage * reading.current
@@ -260,7 +248,7 @@ class Estimator:
             power,
             self._inputs.conditions(now, self.signals.motor_temperature.get(now)),
             self._inputs.effect_inputs(now),
-            max((self._timing.periods[i] for i in self._speeds), default=0.0),
+            next((self.signals[role].period for role in self.signals.mapped(SPEEDS)), 0.0),
             self._drive(now, reading.voltage, power),
         )
 
@@ -276,7 +264,8 @@ class Estimator:
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
-        lost = loss_variance(self._reasons(now) | self._missing.lacking)
+        missing = self._reasons(now) | int(self.signals.lacking)
+        lost = sum([variance for reason, variance in _LOSS_VARIANCES if reason & missing])
         conditions = self._inputs.conditions(now)
         soc = self.soc.ageing.state_of_charge(filter_)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activity.now))
@@ -290,8 +279,9 @@ class Estimator:
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
         motion, filter_ = self.motion, self.filter
-        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted, distance=motion.distance)
-        silent = self._time is None or now - self._time > max(SILENT_AFTER, self._timing.pause)
+        reasons = self._reasons(now)
+        estimate = Estimate(time=now, reasons=Reason(reasons), distrusted=self._distrusted, distance=motion.distance)
+        silent = self._time is None or now - self._time > max(SILENT_AFTER, self.signals.pause)
         estimate.activity = self._activity.shown(silent, self.soc.joined)
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = motion.speed, motion.acceleration, motion.grade
@@ -308,22 +298,22 @@ class Estimator:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self._outlook.report(estimate)
         estimate.why = self.explainer.latest if self._outlook.forecast else None
-        reasons = int(estimate.reasons)  # plain numbers: ten times a second flags take longer than all of the above
-        estimate.state = State.DEGRADED if reasons & int(DEGRADING) else State.VALID
-        missing = reasons | int(self._missing.lacking)
-        if (silent and missing & int(NO_PACK) == int(NO_PACK)) or reasons & int(Reason.SIGNALS_SLOW):
+        reasons = int(estimate.reasons)
+        estimate.state = State.DEGRADED if reasons & _DEGRADING else State.VALID
+        missing = reasons | int(self.signals.lacking)
+        if (silent and missing & _NO_PACK == _NO_PACK) or reasons & Reason.SIGNALS_SLOW:
             estimate.state = State.INVALID
         return estimate
 
-    def _reasons(self, now: float) -> Reason:
+    def _reasons(self, now: float) -> int:
         s = self.signals
-        reasons = self._missing.reasons(now, self._activity.takes_charge or s.carried)
+        reasons = s.missing(now, self._activity.takes_charge or s.carried)
         if self.plausibility.pack.current_difference.contradicts:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.plausibility.pack.voltage_dispute or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
         if differ or self.soc.gate.mismatch:
             reasons |= Reason.VOLTAGE_MISMATCH
-        if self._timing.sampled > SLOWEST:
+        if self.signals.sampled > TIMING.slowest:
             reasons |= Reason.SIGNALS_SLOW
         if self.soc.restarted(now):
             reasons |= Reason.SOC_RESTARTED
@@ -371,8 +361,3 @@ class Estimator:
             self._temperatures.cells = saved["cell_temperature"]
         self.soc.restore(read_saved(saved), age, self.soc.effects.read(saved["cell_effects"]))
         self.forecaster.learner.pause(NEW_DAY if age is None else age)
-
-
-def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:
-    """The groups that carry these roles, in the order of the roles."""
-    return [i for role in roles for i, group in enumerate(groups) if role in group.roles]

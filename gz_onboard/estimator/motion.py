@@ -85,7 +85,7 @@ class Motion:
     def step(self, now: float, dt: float, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
         """Go `dt` [s] ahead to `now` [s]."""
         factors = speed_factors(wheel_radius, gear_ratio).items()
-        speeds = (shown * factor for role, factor in factors if (shown := signals[role].mean(now)) is not None)
+        speeds = (shown * factor for role, factor in factors if (shown := signals[role].mean) is not None)
         speed = next(speeds, None)
         if speed is None:
             self.speed = self.acceleration = None
@@ -107,7 +107,7 @@ class Motion:
             self.altitude = None
 
     def _update_lean(self, now: float, dt: float, signals: Signals) -> None:
-        roll, yaw, speed = signals.rate_x.mean(now), signals.rate_z.mean(now), self.speed
+        roll, yaw, speed = signals.rate_x.mean, signals.rate_z.mean, self.speed
         if roll is None or yaw is None or speed is None:
             self.lean = self.yaw_rate = None
             return
@@ -120,7 +120,7 @@ class Motion:
         if abs(speed) > MOTION.turning_speed:
             steady = -atan(speed * self.yaw_rate / GRAVITY)
         else:
-            steady = asin(min(max((signals.accel_y.mean(now) or 0.0) / GRAVITY, -1.0), 1.0))
+            steady = asin(min(max((signals.accel_y.mean or 0.0) / GRAVITY, -1.0), 1.0))
         lean += (roll - bias_x) * dt
         self.lean = lean + (steady - lean) * min(dt / MOTION.lean_time, 1.0)
 
@@ -139,7 +139,7 @@ class Motion:
         self.heading = None if heading is None else heading % (2 * pi)
 
     def _update_grade(self, now: float, dt: float, signals: Signals) -> None:
-        forward = signals.accel_x.mean(now)
+        forward = signals.accel_x.mean
         measured = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
         distrusted = not (signals.accel_x.trusted and signals.gps_altitude.trusted)
         nothing = forward is None and measured is None and (distrusted or self.altitude is None)
@@ -263,7 +263,7 @@ class VibrationMonitor:
 
     def step(self, now: float, accel_z: Signal) -> None:
         """Take the samples of the window that ends at `now` [s]."""
-        n, mean = accel_z.count, accel_z.mean(now)
+        n, mean = accel_z.count, accel_z.mean
         if n * MOTION.max_sample_interval < WINDOW or mean is None or accel_z.mean_square is None:
             return
         square = (accel_z.mean_square - mean * mean) * n / (n - 1)

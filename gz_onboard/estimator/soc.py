@@ -21,7 +21,7 @@ from gz_onboard.estimator.initial import (
 )
 from gz_onboard.estimator.plausibility.electrical import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
-from gz_onboard.estimator.signals import Signals
+from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
 from gz_onboard.estimator.start import (
     BRIDGE,
@@ -32,7 +32,6 @@ from gz_onboard.estimator.start import (
     plausible,
     uncounted_sd,
 )
-from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -59,15 +58,7 @@ class RidingModel(Protocol):
 class StateOfCharge:
     """The filter of one pack, and what it is begun from."""
 
-    def __init__(
-        self,
-        battery: Battery,
-        model: Model,
-        make: FilterMaker,
-        signals: Signals,
-        timing: MessageTiming,
-        sag: VoltageSag,
-    ) -> None:
+    def __init__(self, battery: Battery, model: Model, make: FilterMaker, signals: Signals, sag: VoltageSag) -> None:
         self.filter: SocFilter | None = None
         self.gate = InnovationGate()
         self.ageing = Ageing(battery)
@@ -78,7 +69,7 @@ class StateOfCharge:
         self.saved_age: float | None = None  # s
         self.current: float | None = None  # A of the pack, at the last step
         self._unseen = STOOD  # s: for so long, and not longer, its load was not seen
-        self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
+        self._battery, self._make, self._signals = battery, make, signals
         self._sag = sag
         self._resistance_sd = self.uncertainty.resistance
         self._charge = ChargeUncertainty(battery, model.parameters)
@@ -228,7 +219,7 @@ class StateOfCharge:
         received = shown.time if shown.fresh(now) else self._signals.inverter_voltage.time
         if received == self._voltage_time:
             return
-        pause = self._timing.pause
+        pause = self._signals.pause
         dt = min(now - self._voltage_taken, pause) if self._voltage_taken > -inf else dt
         self._voltage_time, self._voltage_taken = received, now
         if self.synchroniser.latency and shown.fresh(now):
@@ -251,12 +242,12 @@ class StateOfCharge:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
         mean = current or 0.0  # over the window
-        if dt > self._timing.pause:  # of what flowed meanwhile only the ends are known
+        if dt > self._signals.pause:  # of what flowed meanwhile only the ends are known
             mean = (mean + (self.current if self.current is not None else mean)) / 2
         charge = HOUR * battery.pack_capacity(temperature)
-        sampled, pause = self._timing.sampled, self._timing.pause
+        sampled, pause = self._signals.sampled, self._signals.pause
         # Beyond, most that flows is not seen.
-        counted = pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
+        counted = pack.reading.source if sampled <= TIMING.slowest else CurrentSource.NONE
         error, apart = CURRENT_ERRORS[counted], pack.reading.current_apart
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
@@ -311,7 +302,7 @@ class StateOfCharge:
             self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
         before = filter_.soc, filter_.error, filter_.covariance
         self.another_pack = self.ageing.permit(now, reading, self._signals, filter_)
-        if dt <= self._timing.pause and self._rest.step(
+        if dt <= self._signals.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
             self.ageing.corrected(filter_, before)
@@ -335,7 +326,7 @@ class StateOfCharge:
         if self.filter and self.gate.contradicted and not self.gate.off and self.ageing.doubt(filter_):
             self.gate.settle()
         if not self.gate.off:
-            self.ageing.load(min(dt, self._timing.pause), drop + filter_.v1, error)
+            self.ageing.load(min(dt, self._signals.pause), drop + filter_.v1, error)
         if self.ageing.apply(dt):
             self.uncertainty.resistance = max(self._resistance_sd, self.ageing.resistance.sd)
 
@@ -372,7 +363,7 @@ class StateOfCharge:
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
         least = DOUBT_WAIT if self.saved and self._signals.has_rejected else START_WAIT if missing else STEADY_TIME
         battery = self._battery
-        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, least)
+        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._signals.pause, least)
         if found is None:
             return
         first, unsteady_sd = found

@@ -6,8 +6,8 @@ from math import sqrt
 from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
+from gz_onboard.estimator.signals import TIMING
 from gz_onboard.estimator.sources import CurrentSource
-from gz_onboard.estimator.timing import COARSE
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
 
@@ -67,7 +67,7 @@ class ChargeUncertainty:
     @staticmethod
     def between_samples(dt: float, period: float) -> float:
         """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
-        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > COARSE else 0.0
+        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > TIMING.coarse else 0.0
 
     def uncounted(self, more: float, soc_sd: float) -> float:
         """Variance after `more` of SOC may have flowed that was not counted, as in a pause.

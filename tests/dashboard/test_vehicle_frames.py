@@ -17,7 +17,7 @@ from gz_onboard.dashboard.command import view_of
 from gz_onboard.dashboard.picture import Picture, picture
 from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import View
-from gz_onboard.estimator.signals import ACCEPTED_AFTER
+from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import Activity, Estimate
 from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.functions import PiecewiseLinear
@@ -119,7 +119,7 @@ def test_limits_are_those_of_the_controller():
 # --- the day ------------------------------------------------------------------------------------------------------
 
 
-def ridden(kept: Path | None, *seen: tuple[float, int], lasts: float = ACCEPTED_AFTER) -> float | None:
+def ridden(kept: Path | None, *seen: tuple[float, int], lasts: float = TIMING.accepted_after) -> float | None:
     """Of odometers [km] at times [ns], each of which lasts so long [s]."""
     frames, now = VehicleFrames(REFERENCE, kept), 1.0
     frames.take(own_frame(*PACK, seen[0][1]), now)

@@ -11,11 +11,11 @@ import pytest
 from gz_onboard.constants import HOUR
 from gz_onboard.estimator.ageing import CAPACITY, Ageing
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
-from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.start import update_soc
 from gz_onboard.physics.battery import Battery
 from gz_onboard.vehicle import read_vehicle
+from tests.events import ShownSignals
 
 DT, WARM = 1.0, 25.0  # s, degC
 ERROR = Noise(1e-10, 0.008**2, 573.0)
@@ -27,8 +27,8 @@ def fresh() -> Battery:
     return read_vehicle("reference").pack
 
 
-def known_signals() -> Signals:
-    signals = Signals([("cell_temperature", 2.0), ("pack_voltage", 2.0)])
+def known_signals() -> ShownSignals:
+    signals = ShownSignals("cell_temperature", "pack_voltage")
     signals.cell_temperature.time = signals.pack_voltage.time = 0.0
     return signals
 

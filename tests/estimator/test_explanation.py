@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, EffectInputs
-from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Explanation
 from gz_onboard.log_rows import explanation_row
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.events import ShownSignals
 
 VEHICLE = read_vehicle("reference")
 MILD = Conditions(20.0, 0.0)
@@ -51,7 +51,7 @@ def ride(
 
 
 def explained(f: Forecaster, *, soc: float = 0.7, cells: float = 20.0, air: Conditions = MILD) -> Explanation:
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
     result = f.forecast(soc, 0.01, cells, 1.0, air.ambient, air.altitude)
     explainer.take(0.0, result, soc, air, 0.0)
     why = explainer.latest
@@ -81,7 +81,7 @@ STATES = st.tuples(st.floats(-0.05, 1.05), st.floats(-20.0, 45.0), st.floats(-20
 @given(RIDINGS, STATES, STATES, st.one_of(st.none(), st.floats(40.0, 200.0)))
 def test_the_causes_add_up(riding, first, then, payload):
     f = forecaster(VEHICLE if payload is None else read_vehicle("reference", payload))
-    explainer, distance = RangeExplainer(f, Signals(())), 0.0
+    explainer, distance = RangeExplainer(f, ShownSignals()), 0.0
     for time, (soc, cells, ambient, altitude) in enumerate((first, then)):
         air = Conditions(ambient, altitude)
         result = f.forecast(soc, 0.01, cells, 1.0, ambient, altitude)
@@ -109,13 +109,13 @@ def against(f: Forecaster, usual: Forecaster, **state: float) -> Explanation:
     """The range of `f` against that of `usual`, which differs in one thing."""
     results = []
     for each in (usual, f):
-        explainer = RangeExplainer(each, Signals(()))
+        explainer = RangeExplainer(each, ShownSignals())
         ambient, soc, cells = state.get("ambient", 20.0), state.get("soc", 0.7), state.get("cells", 20.0)
         if each is usual:
             ambient = cells = 20.0
         result = each.forecast(soc, 0.01, cells, 1.0, ambient, 0.0)
         results.append(explainer.state(0.0, result, soc, Conditions(ambient, 0.0), 0.0))
-    return RangeExplainer(f, Signals(())).explain(*results)
+    return RangeExplainer(f, ShownSignals()).explain(*results)
 
 
 def ridden(**riding: float) -> Forecaster:
@@ -209,7 +209,7 @@ def test_cells_that_have_aged_are_named():
 def test_a_heater_is_told_from_what_nobody_knows():
     """Both are in the consumption factor; the power of one is measured."""
     f = forecaster()
-    signals = Signals([("heater_power", 10.0)])
+    signals = ShownSignals("heater_power", stale=10.0)
     explainer, heater, x = RangeExplainer(f, signals), 150.0, 0.0
     for second in range(900):
         v = 10.0
@@ -230,7 +230,7 @@ def test_a_heater_is_told_from_what_nobody_knows():
 
 def test_a_cause_that_did_not_change_has_no_part_in_a_change():
     f = forecaster()
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
     for time, soc in enumerate((0.7, 0.6)):
         explainer.take(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
     (change,) = explainer.changes
@@ -242,7 +242,7 @@ def test_a_cause_that_did_not_change_has_no_part_in_a_change():
 
 def test_a_charge_is_one_change_explained_when_it_is_over():
     f = forecaster()
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
     way = [(0.9, 0.0), (0.5, 1000.0), *((0.5 + 0.1 * i, 1000.0) for i in range(1, 5)), (0.89, 1000.0), (0.4, 2000.0)]
     for i, (soc, ridden) in enumerate(way):
         forecast = f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0)
@@ -259,7 +259,7 @@ def test_a_charge_is_one_change_explained_when_it_is_over():
 
 def test_what_is_ridden_as_expected_is_no_change():
     f = forecaster()
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
     first = f.forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0)
     explainer.take(0.0, first, 0.8, MILD, 0.0)
     then = f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
@@ -270,7 +270,7 @@ def test_what_is_ridden_as_expected_is_no_change():
 def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
     f = forecaster()
     ride(f, 3)
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
 
     def take(now: float) -> None:
         explainer.take(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
@@ -289,7 +289,7 @@ def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
 
 def test_the_split_is_made_seldom_and_not_of_a_range_that_stays():
     f = forecaster()
-    explainer = RangeExplainer(f, Signals(()))
+    explainer = RangeExplainer(f, ShownSignals())
     for second in range(400):
         soc = 0.8 - second * 1e-6
         explainer.take(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0)

@@ -9,8 +9,8 @@ import pytest
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.motion import Motion, accelerated
-from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import ROLES, RoleWindow
+from gz_onboard.events import ROLES
+from tests.events import ShownSignals
 
 RADIUS = 0.2438
 
@@ -18,7 +18,7 @@ RADIUS = 0.2438
 def drive(seconds, truth, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
     """Run the filter over `truth`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
     rng = np.random.default_rng(seed)
-    signals = Signals((role, 2.0) for role in ROLES if role not in without)
+    signals = ShownSignals(*(role for role in ROLES if role not in without))
     motion = Motion()
     heading, rows, before = 0.0, [], truth(0.0)
     for step in range(1, round(seconds / dt) + 1):
@@ -36,11 +36,10 @@ def drive(seconds, truth, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
             "gps_fix": 3.0,
             "gps_altitude": altitude + 1.5 * rng.standard_normal(),
         }
-        for role, value in values.items():
-            if role not in without and (role != "gps_altitude" or t < altitude_until):
-                signals[role].take(RoleWindow(t, value, 1, value))
+        if t >= altitude_until:
+            del values["gps_altitude"]
+        signals.show(t, {role: value for role, value in values.items() if role not in without})
         motion.step(t, dt, signals, RADIUS, 1.0)
-        signals.next_window()
         before = (speed, grade, lean, yaw, altitude)
         found = t, motion.speed, motion.grade, motion.lean, motion.yaw_rate, motion.heading
         rows.append((*found, grade, lean, yaw, heading))
@@ -69,12 +68,10 @@ def turning(t):
 
 def test_a_gyro_with_a_large_offset_is_learned_at_rest():
     motion = Motion()
-    signals = Signals((role, 2.0) for role in ROLES)
+    signals = ShownSignals(*ROLES)
     for step in range(1, 300):
-        for role, value in (("motor_speed", 0.0), ("rate_x", 0.1), ("rate_z", -0.12), ("accel_y", 0.0)):
-            signals[role].take(RoleWindow(step * 0.1, value, 1, value))
+        signals.show(step * 0.1, {"motor_speed": 0.0, "rate_x": 0.1, "rate_z": -0.12, "accel_y": 0.0})
         motion.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
-        signals.next_window()
     assert motion.gyro_bias[0] == pytest.approx(0.1, abs=0.005)
     assert motion.gyro_bias[1] == pytest.approx(-0.12, abs=0.005)
 

@@ -8,10 +8,10 @@ import pytest
 
 from gz_onboard.estimator.plausibility.residual import StepInputs, faulty
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck
-from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES, Activity
 from tests.estimator.life import MOTOR, Scooter, estimator, follow
 from tests.estimator.test_plausibility import town
+from tests.events import ShownSignals
 
 RADIUS, GEAR, STEP = 0.25, 0.5, 0.1  # m, 1, s
 Odometer = Callable[[float, float], float | None]
@@ -19,12 +19,12 @@ Odometer = Callable[[float, float], float | None]
 
 def ridden(odometer: Odometer, wheel: Callable[[float, float], float], seconds: float = 2400.0) -> set[str]:
     """Who is named. odometer: what it says of (time [s], distance [m]); None: nothing. wheel: of (time, speed)."""
-    signals, speeds = Signals((role, 2.0) for role in ROLES), SpeedCheck(RADIUS, GEAR, 30.0)
+    signals, speeds = ShownSignals(*ROLES), SpeedCheck(RADIUS, GEAR, 30.0)
     distance, named = 0.0, set[str]()
     for i in range(round(seconds / STEP)):
         t = i * STEP
         distance += town(t) * STEP
-        signals.wheel_speed_rear.value, signals.wheel_speed_rear.time = wheel(t, town(t)) / RADIUS, t
+        signals.show(t, {"wheel_speed_rear": wheel(t, town(t)) / RADIUS})
         told = odometer(t, distance)
         if i % 10 == 0 and told is not None:
             signals.odometer.value, signals.odometer.time = told, t

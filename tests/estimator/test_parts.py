@@ -8,13 +8,13 @@ import pytest
 
 from gz_onboard.estimator.gate import CONTRADICTED, GATE_COUNT, InnovationGate
 from gz_onboard.estimator.initial import STEADY_AFTER, STEADY_TIME, STEADY_WAIT, SteadyVoltage
-from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, HISTORY_TIME, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.events import ROLES, Reason
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
+from tests.events import ShownSignals
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
@@ -23,9 +23,8 @@ LOAD = 0.005**2  # V²
 
 
 def everything(now: float = 0.0) -> Signals:
-    signals = Signals((role, 2.0) for role in ROLES)
-    for role in ROLES:
-        signals[role].time, signals[role].value = now, 3.0
+    signals = ShownSignals(*ROLES)
+    signals.show(now, dict.fromkeys(ROLES, 3.0))
     return signals
 
 
@@ -93,7 +92,7 @@ def test_two_currents_that_differ_confirm_each_other_to_no_better():
 
 def test_an_altitude_that_is_missing_is_no_full_position():
     signals = everything()
-    missing = MissingSignals(signals).reasons
+    missing = signals.missing
     signals.gps_fix.value = 2.0
     assert missing(1.0) == Reason.NO_GPS
     signals.gps_fix.value = 3.0
@@ -101,16 +100,14 @@ def test_an_altitude_that_is_missing_is_no_full_position():
     assert missing(1.0) == Reason.NO_GPS
 
 
-def test_reasons_and_what_they_cost():
+def test_a_signal_that_is_left_out_or_stale_is_a_reason():
     signals = everything()
-    missing = MissingSignals(signals).reasons
+    missing = signals.missing
     assert missing(1.0) == Reason(0)
-    assert loss_variance(Reason(0)) == 0.0
     signals.accel_x.trusted = False
     signals.gps_fix.value = 1.0
     signals.motor_speed.time = -10.0
     assert missing(1.0) == Reason.NO_IMU | Reason.NO_GPS
-    assert loss_variance(Reason.NO_IMU | Reason.NO_GPS) == LOSS_SD[Reason.NO_IMU] ** 2 + LOSS_SD[Reason.NO_GPS] ** 2
     assert missing(10.0) & Reason.NO_SPEED
 
 

@@ -13,8 +13,9 @@ from gz_onboard.estimator.plausibility.inertial import GradeCheck
 from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, StepInputs, faulty
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck, vote
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import ROLES, RoleWindow
+from gz_onboard.events import ROLES
 from gz_onboard.vehicle import read_vehicle
+from tests.events import ShownSignals
 
 RADIUS, GEAR, CAPACITY = 0.25, 0.5, 30.0  # m; wheel speed over motor speed; Ah
 STEP = 0.1  # s
@@ -47,18 +48,14 @@ def ridden(
     dt: float = STEP,
 ) -> tuple[SpeedCheck, Signals]:
     """`seconds` of riding; a fault makes of (time [s], true value) what is reported, None being nothing; each: step."""
-    signals = Signals((role, 2.0) for role in ROLES)
+    signals = ShownSignals(*ROLES)
     speeds = watch or SpeedCheck(RADIUS, GEAR, CAPACITY)
     for step in range(round(seconds / dt)):
         t = begin + step * dt
-        for role in roles:
-            value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
-            value = faults[role](t, value) if role in faults and value is not None else value
-            if value is not None:
-                signals[role].take(RoleWindow(t, value, 1, value))
+        shown = {role: truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t)) for role in roles}
+        signals.show(t, {role: faults[role](t, v) if role in faults else v for role, v in shown.items()})
         speeds.step(StepInputs(t, dt, dt, signals, None))
         each(t, signals, speeds)
-        signals.next_window()
     return speeds, signals
 
 
@@ -163,8 +160,8 @@ def test_of_two_that_disagree_and_move_neither_is_believed():
     speeds, signals = ridden(60.0, roles, {"motor_speed": lambda t, v: 1.6 * v})
     assert faulty(speeds.counters) == set(roles)
     assert speeds.disputed
-    assert signals.motor_speed.mean(59.9) is None
-    assert signals.motor_speed.reported(59.9) is not None
+    assert signals.motor_speed.mean is None
+    assert signals.motor_speed.reported is not None
 
 
 def test_forgiven_only_after_a_minute_of_agreement_about_something():
@@ -180,12 +177,11 @@ def test_forgiven_only_after_a_minute_of_agreement_about_something():
 
 
 def test_a_gps_without_a_fix_does_not_count():
-    signals = Signals((role, 2.0) for role in ROLES)
+    signals = ShownSignals(*ROLES)
     speeds = SpeedCheck(RADIUS, GEAR, CAPACITY)
     for step in range(300):
         t = step * STEP
-        for role, value in {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0}.items():
-            signals[role].value, signals[role].time = value, t
+        signals.show(t, {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0})
         speeds.step(StepInputs(t, STEP, STEP, signals, None))
     assert faulty(speeds.counters) == set()
 
@@ -239,8 +235,8 @@ def test_a_steady_current_shows_no_sag():
 VEHICLE = read_vehicle("reference", 75.0)
 
 
-def pack_sensors(roles: tuple[str, ...]) -> tuple[PackSensors, Signals]:
-    signals = Signals((role, 2.0) for role in roles)
+def pack_sensors(roles: tuple[str, ...]) -> tuple[PackSensors, ShownSignals]:
+    signals = ShownSignals(*roles)
     return PackSensors(signals, VEHICLE.pack, VEHICLE.parameters), signals
 
 
@@ -268,9 +264,7 @@ def driven(
         voltage = REST_VOLTAGE - RESISTANCE * true["pack_current"]
         cable = VEHICLE.parameters["cable_resistance"] * true["pack_current"]
         true |= {"pack_voltage": voltage, "inverter_voltage": voltage - cable}
-        for role, value in true.items():
-            fault = faults.get(role) if t >= 60.0 else None
-            signals[role].value, signals[role].time = (fault(t, value) or 0.0) if fault else value, t
+        signals.show(t, true | {role: fault(t, true[role]) for role, fault in faults.items() if t >= 60.0})
         power = voltage * true["pack_current"]
         reading = check.read(t, dt, 10.0 if inverter else 0.0, CellEvidence(error, road_power, rms))
         used = signals.pack_current.value if reading.current is None else reading.current
@@ -321,8 +315,8 @@ def test_a_current_that_cells_and_road_contradict_is_left_out(roles: tuple[str, 
     evidence = CellEvidence(lambda voltage, current, sensor: -0.004 * (100.0 - current), lambda: 5000.0, 0.1)
     for step in range(600):
         t = step * STEP
-        for role, value in {"pack_current": -20.0, "inverter_current": -20.5, "pack_voltage": 50.0}.items():
-            signals[role].value, signals[role].time = value, t if role in (*roles, "pack_voltage") else -1e9
+        values = {"pack_current": -20.0, "inverter_current": -20.5, "pack_voltage": 50.0}
+        signals.show(t, {role: values[role] for role in (*roles, "pack_voltage")})
         reading = check.read(t, STEP, 10.0, evidence)
     assert reading.current is None
     assert faulty(check.counters) == set(roles)
@@ -334,11 +328,11 @@ MASS, FORCE, WIND, MOUNTED = 200.0, 100.0, 25.0, 0.02  # kg; N that the level ta
 GRADES = ("accel_x", "gps_altitude")
 
 
-def grade_check() -> tuple[Signals, GradeCheck, SpeedCheck]:
+def grade_check() -> tuple[ShownSignals, GradeCheck, SpeedCheck]:
     """With a motor speed, whose value each test sets as the median of the speeds."""
     speeds = SpeedCheck(RADIUS, GEAR, CAPACITY)
     speeds.roles, speeds.on_road = ("motor_speed",), True
-    return Signals((role, 2.0) for role in ROLES), GradeCheck(MASS), speeds
+    return ShownSignals(*ROLES), GradeCheck(MASS), speeds
 
 
 def hills(
@@ -365,12 +359,8 @@ def hills(
             "accel_x": acceleration + GRAVITY * (grade + MOUNTED) + 0.1 * sin(77 * t),
             "gps_altitude": height + sin(t / 60),
         }
-        for role in roles:
-            value: float | None = honest[role]
-            if role in faults and t >= begin:
-                value = faults[role](t - begin, honest[role])
-            if value is not None:
-                signals[role].value, signals[role].time = value, t
+        shown = {role: faults[role](t - begin, v) if role in faults and t >= begin else v for role, v in honest.items()}
+        signals.show(t, {role: shown[role] for role in roles})
         work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
         grades.step(StepInputs(t, dt, dt, signals, speed))
         speeds.median, speeds.on_road, signals.motor_speed.time = speed, on_road, t
@@ -454,7 +444,7 @@ def beside_speeds(speeds_as: Mapping[str, Fault], accelerometer: Fault = lambda 
     def compare(t: float, signals: Signals, speeds: SpeedCheck) -> None:
         value = accelerometer(t, (brisk(t) - brisk(t - STEP)) / STEP + 0.1 * sin(77 * t))
         assert value is not None
-        signals.accel_x.value, signals.accel_x.time = value, t
+        signals.accel_x.reported, signals.accel_x.time = value, t
         grades.compare(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
 
     ridden(120.0, tuple(speeds_as), speeds_as, brisk, each=compare)
@@ -513,7 +503,7 @@ def test_pulling_away_on_a_slope_is_no_fault():
             t = step * STEP
             acceleration = 1.0 if step > 300 and speed < 12 else 0.0
             speed += acceleration * STEP
+            signals.show(t, {"accel_x": acceleration + GRAVITY * grade + 0.1 * sin(77 * t)})
             speeds.median, signals.motor_speed.time = speed, t
-            signals.accel_x.value, signals.accel_x.time = acceleration + GRAVITY * grade + 0.1 * sin(77 * t), t
             grades.compare(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
             assert not grades.faulty

@@ -16,10 +16,10 @@ from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
 from gz_onboard.estimator.route import PreparedRoute, RouteForecaster
 from gz_onboard.estimator.route_position import HeightCheck
-from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
 from gz_onboard.physics.drawable import Drawable, drawable, soc_left
 from gz_onboard.routes.route import Route
+from tests.events import ShownSignals
 from tests.support import reference
 
 AIR = Conditions(20.0, 300.0)
@@ -46,7 +46,7 @@ class Rider:
 
     def __init__(self, route=None):
         vehicle = reference()
-        self.motion, self.signals = Motion(altitude=300.0), Signals([])
+        self.motion, self.signals = Motion(altitude=300.0), ShownSignals()
         self.forecaster = Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
         self.forecast = RouteForecaster(self.forecaster, self.motion, self.signals)
         self.now, self.route = 0.0, route
@@ -227,7 +227,7 @@ def test_a_slow_climb_makes_no_slow_rider():
 
 def test_off_the_route_it_is_as_without_one_and_comes_back():
     rider = Rider(way(5e3))
-    rider.signals = rider.forecast._signals = Signals([("latitude", 2.0), ("longitude", 2.0)])
+    rider.signals = rider.forecast._signals = ShownSignals("latitude", "longitude")
     rider.settled()
 
     def at(east, north):

@@ -74,6 +74,7 @@ def fed(samples, monitor=None):
         values = [z for _, z in window]
         square = sum(z * z for z in values) / len(values)
         signal.take(RoleWindow(window[-1][0], values[-1], len(values), sum(values) / len(values), square))
+        signal.reported = signal.window_mean
         monitor.step(window[-1][0], signal)
     return monitor
 

@@ -16,13 +16,12 @@ import pytest
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator import outlook
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.weakest import CHARGE, CONFIG, NAMES, VoltageBlock, WeakestGroup
 from gz_onboard.events import Cause, Group
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
-from tests.events import Event, EventEstimator, events_of
+from tests.events import Event, EventEstimator, ShownSignals, events_of
 from tests.plant.machine import SERIES
 from tests.plant.packs import STEP, Discharge, discharge
 from tests.plant.ride import Hidden
@@ -195,7 +194,7 @@ def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
 
 def fed(battery: Battery, missing: float, soc: tuple[float, float]) -> WeakestGroup:
     """What is learned of a group of which so much is `missing`, between two states of charge of the mean cell."""
-    weakest = WeakestGroup(battery, Signals([("lowest_cell_voltage", 10.0)]), VEHICLE.parameters)
+    weakest = WeakestGroup(battery, ShownSignals("lowest_cell_voltage", stale=10.0), VEHICLE.parameters)
     for z in np.arange(soc[0], soc[1], -CONFIG.block):
         block = VoltageBlock(z)
         for k in range(CONFIG.min_samples):

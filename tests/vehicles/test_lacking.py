@@ -6,7 +6,7 @@ import re
 from math import log
 from pathlib import Path
 
-from gz_onboard.estimator.reasons import LOSS_SD
+from gz_onboard.estimator.estimator import LOSS_SD
 from gz_onboard.events import Estimate, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import lacking

@@ -19,7 +19,7 @@ from gz_onboard.estimator.plausibility.residual import (
     isolate,
     share_of_new,
 )
-from gz_onboard.estimator.signals import Signal, Signals
+from gz_onboard.estimator.signals import TIMING, Signal, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.events import CURRENTS, VOLTAGES
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -104,9 +104,9 @@ class PackSensors:
     def read(self, now: float, dt: float, speed: float | None, evidence: CellEvidence) -> PackReading:
         """Best voltage and current of this step of `dt` [s], at a `speed` [m/s]."""
         signals, parameters = self._signals, self._parameters
-        voltage, inverter_voltage = signals.pack_voltage.reported(now), signals.inverter_voltage.reported(now)
-        pack, inverter = signals.pack_current.reported(now), signals.inverter_current.reported(now)
-        auxiliary = signals.auxiliary_current.reported(now)
+        voltage, inverter_voltage = signals.pack_voltage.reported, signals.inverter_voltage.reported
+        pack, inverter = signals.pack_current.reported, signals.inverter_current.reported
+        auxiliary = signals.auxiliary_current.reported
         any_voltage = inverter_voltage if voltage is None else voltage
         usual = parameters["auxiliary_power"] / (any_voltage or self._usual_voltage)
         extra = 0.0 if auxiliary is None else auxiliary - usual
@@ -266,4 +266,4 @@ class PackSensors:
 
 def together(first: Signal, second: Signal) -> bool:
     """Whether two sensors report at about the same time, or one of them never did."""
-    return isinf(first.time + second.time) or abs(first.time - second.time) <= CONFIG.coarse_s
+    return isinf(first.time + second.time) or abs(first.time - second.time) <= TIMING.coarse

@@ -53,7 +53,7 @@ class InertialCheck:
         dt, moving = step.observed, step.speed is not None and abs(step.speed) > CONFIG.moving_m_s
         for role, (usual, limit) in AXES.items():
             signal, mean = step.signals[role], self._mean[role]
-            value = signal.reported(step.now)
+            value = signal.reported
             if value is None:
                 continue
             mean.update(dt, value - usual, limit)
@@ -149,7 +149,7 @@ class GradeCheck:
             self._begin(step.now, None)
             self._before = None
         signals, counter = step.signals, self.counters["gps_altitude"]
-        altitude = None if signals.fix_below(step.now, FIX_3D) else signals.gps_altitude.reported(step.now)
+        altitude = None if signals.fix_below(step.now, FIX_3D) else signals.gps_altitude.reported
         evidence = min(step.dt, CONFIG.evidence_s)
         change = (CONFIG.steepest * abs(step.speed or 0.0) + CONFIG.altitude_wander_m_s) * step.dt
         possible = self._past.allows(evidence, altitude, change, change, CONFIG.altitude_jump_m)
@@ -166,7 +166,7 @@ class GradeCheck:
         if speed is None or self._speed is None or speeds.roles != self._roles:
             self._begin(now, speed, speeds.roles)
             return
-        forward = signals.accel_x.reported(now)
+        forward = signals.accel_x.reported
         self._seconds += dt
         self._distance += abs(speed) * dt
         self._impulse = None if self._impulse is None or forward is None else self._impulse + forward * dt

@@ -57,7 +57,6 @@ class PlausibilityConfig:
     fastest_m_s: float = 70.0
 
     # Currents.
-    coarse_s: float = 0.55  # messages further apart are not compared
     current_skew_s: float = 2.0  # the two sensors do not sample at the same time
     electrical_time_s: float = 10.0
     current_sd_rate: float = 0.10  # 1/h

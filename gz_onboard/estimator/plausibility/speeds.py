@@ -97,7 +97,7 @@ class SpeedCheck:
         step.signals.gps_speed.trusted = step.signals.gps_course.trusted = fix
         for role in SPEEDS if fix else SPEEDS[:-1]:
             signal = step.signals[role]
-            reported = signal.reported(step.now)
+            reported = signal.reported
             if reported is not None:
                 speed = reported * self._scale[role]
                 self._unchanged[role].update(step.observed, speed)
@@ -163,15 +163,15 @@ class SpeedCheck:
 
     def _is_carried(self, step: StepInputs) -> bool:
         """Whether only the GPS moves, as in a van: motor and wheels rest, and no current drives."""
-        signals, now = step.signals, step.now
-        current = signals.inverter_current.reported(now)
-        current = signals.pack_current.reported(now) if current is None else current
-        own = [abs(value) for role in SPEEDS[:-1] if (value := signals[role].reported(now)) is not None]
+        signals = step.signals
+        current = signals.inverter_current.reported
+        current = signals.pack_current.reported if current is None else current
+        own = [abs(value) for role in SPEEDS[:-1] if (value := signals[role].reported) is not None]
         at_rest = bool(own) and max(own) <= CONFIG.rest_noise
         if not at_rest or current is None or abs(current) > self._idle_current:
             self._rest = 0.0
             return False
-        moves = (signals.gps_speed.reported(now) or 0.0) >= CONFIG.speed_sd_m_s
+        moves = (signals.gps_speed.reported or 0.0) >= CONFIG.speed_sd_m_s
         if not moves:
             self._rest += step.observed
         elif self._rest < CONFIG.carried_rest_s:

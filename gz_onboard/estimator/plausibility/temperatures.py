@@ -26,7 +26,7 @@ class TemperatureCheck:
         evidence = min(step.dt, CONFIG.evidence_s)
         for role, (low, high, rise, fall) in LIMITS.items():
             signal, counter = step.signals[role], self.counters[role]
-            value = signal.reported(step.now)
+            value = signal.reported
             in_range = value is not None and low < value < high
             limits = rise * step.dt, fall * step.dt, CONFIG.temperature_jump_k
             possible = self._past[role].allows(evidence, value if in_range else None, *limits) and in_range

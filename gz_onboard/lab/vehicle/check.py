@@ -17,7 +17,7 @@ from gz_onboard.bus.codec import LONGEST_PAUSE_NS, RANGE, Codec
 from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.bus.units import UNITS
-from gz_onboard.estimator.signals import DEFAULT_STALE
+from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
 from gz_onboard.lab.estimate_tally import PAUSE
 from gz_onboard.lab.vehicle import charge, electric, motion, others
@@ -130,7 +130,7 @@ def _never_came(
 
 def _stale(period: float | None) -> float:
     """When a signal of this `period` [s] is stale [s]."""
-    return STALE_PERIODS * period if period else DEFAULT_STALE
+    return STALE_PERIODS * period if period else TIMING.unknown_stale
 
 
 def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from gz_onboard.estimator.reasons import POSITION
+from gz_onboard.estimator.signals import POSITION
 from gz_onboard.events import SPEEDS, words
 
 SPEED = tuple(role for role in SPEEDS if role != "gps_speed")
