@@ -8,29 +8,18 @@ as a number; counts stop at their maximum.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import database_of, find_dbc, read_dbc
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import (
-    EFF_FLAG,
-    MOST_STANDARD,
-    ROLES,
-    TRANSMITTED,
-    Cause,
-    Estimate,
-    Explanation,
-    Frame,
-    Reason,
-    State,
-)
+from gz_onboard.events import EFF_FLAG, MOST_STANDARD, TRANSMITTED, Cause, Estimate, Explanation, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -63,24 +52,18 @@ class Publisher:
     def __init__(self, file: Path | None = None, identifier: int | None = None, step: int = 1) -> None:
         self.file = file or find_dbc(RANGE_DBC)
         self.messages = range_messages(self.file)
+        self.sent: dict[int, Message] = {}
+        """The messages by the identifiers that they are sent with; EFF_FLAG is set in those of 29 bits."""
         self._encoders: dict[str, _Encoder] = {}
+        self._fields: dict[str, _Field] = {}
         for i, (name, message) in enumerate(self.messages.items()):
-            first = identifier_of(message) if identifier is None else identifier + i * step
-            self._encoders[name] = _encoder(message, first | EFF_FLAG if first > MOST_STANDARD else first)
-        self._fields = {name: field for encoder in self._encoders.values() for name, field in encoder.fields.items()}
-        self._reason_bits = [(int(reason), 1 << self._fields[reason_signal(reason)].shift) for reason in Reason]
-        signals = [(role, self._fields.get(sensor_signal(role))) for role in ROLES]
-        self._sensor_bits = [(role, 1 << field.shift) for role, field in signals if field]
-        self._packed: tuple[Estimate | None, int] = None, 0  # the last status
-
-    @cached_property
-    def identifiers(self) -> frozenset[int]:
-        """Of the frames that are sent; EFF_FLAG is set in those of 29 bits."""
-        return frozenset(encoder.identifier for encoder in self._encoders.values())
-
-    def sent(self) -> dict[int, Message]:
-        """The messages by the identifiers that they are sent with."""
-        return {self._encoders[name].identifier: message for name, message in self.messages.items()}
+            sent = identifier_of(message) if identifier is None else identifier + i * step
+            sent |= EFF_FLAG if sent > MOST_STANDARD else 0
+            self.sent[sent] = message
+            self._encoders[name] = _Encoder(message, sent)
+            self._fields |= self._encoders[name].fields
+        self.identifiers = frozenset(self.sent)
+        self._status: tuple[Estimate | None, dict[str, int]] = None, {}  # the last that was packed
 
     def may_have_sent(self, frame: Frame) -> bool:
         """Whether `frame` is like ours, in identifier and checksum: if it is in a log, an earlier run sent it."""
@@ -89,7 +72,7 @@ class Publisher:
 
     def dbc(self) -> bytes:
         """The text of `file` with the identifiers that the frames are sent with."""
-        new = {b"%d" % identifier_of(m): b"%d" % self._encoders[name].identifier for name, m in self.messages.items()}
+        new = {b"%d" % identifier_of(message): b"%d" % identifier for identifier, message in self.sent.items()}
         return _NUMBERED.sub(lambda found: found[1] + b" " + new.get(found[2], found[2]), self.file.read_bytes())
 
     def greatest(self, signal: str) -> float:
@@ -102,59 +85,51 @@ class Publisher:
         e = estimate
         state, remaining, p10, p90 = self.reported(e)
         known = state in KNOWN
-        frames: dict[str, dict[str, float | None]] = {
-            "RANGE_Estimate": {
-                "RANGE_Remaining": remaining,
-                "RANGE_RemainingP10": p10,
-                "RANGE_RemainingP90": p90,
-                "RANGE_EstimateState": state,
-            },
-            "RANGE_Energy": {
-                "RANGE_EnergyLeft": _scaled(e.energy_left, 1 / WH) if known else None,
-                "RANGE_ConsumptionRecent": _scaled(e.consumption_recent, 1 / WH_PER_KM),
-                "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
-            },
-            "RANGE_Diagnosis": {
-                signal: min(count, self.greatest(signal))
-                for signal, count in ((f"RANGE_Count{name.capitalize()}", n) for name, n in vars(counts).items())
-            },
-            "RANGE_Charge": {
-                "RANGE_TimeToFull": _scaled(e.time_to_full, 1 / MINUTE) if known else None,
-                "RANGE_RemainingFull": _scaled(e.range_full, 1e-3) if known else None,
-                "RANGE_ChargePower": e.charge_power if known else None,
-            },
-            "RANGE_Sensors": {},
-            "RANGE_Why": _why(e.why if known else None),
-            "RANGE_Route": {
-                "RANGE_ArrivalStateOfCharge": _scaled(e.arrival_soc, 100) if known else None,
-                "RANGE_ArrivalStateOfChargeP10": _scaled(e.arrival_soc_p10, 100) if known else None,
-                "RANGE_RouteLeft": _scaled(e.route_left, 1e-3) if known else None,
-                "RANGE_BatteryEndsAfter": _scaled(e.battery_ends_after, 1e-3) if known else None,
-                "RANGE_RouteState": e.route_state,
-            },
+        values: dict[str, float | None] = {
+            "RANGE_Remaining": remaining,
+            "RANGE_RemainingP10": p10,
+            "RANGE_RemainingP90": p90,
+            "RANGE_EstimateState": state,
+            "RANGE_EnergyLeft": _scaled(e.energy_left, 1 / WH) if known else None,
+            "RANGE_ConsumptionRecent": _scaled(e.consumption_recent, 1 / WH_PER_KM),
+            "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
+            "RANGE_TimeToFull": _scaled(e.time_to_full, 1 / MINUTE) if known else None,
+            "RANGE_RemainingFull": _scaled(e.range_full, 1e-3) if known else None,
+            "RANGE_ChargePower": e.charge_power if known else None,
+            "RANGE_ArrivalStateOfCharge": _scaled(e.arrival_soc, 100) if known else None,
+            "RANGE_ArrivalStateOfChargeP10": _scaled(e.arrival_soc_p10, 100) if known else None,
+            "RANGE_RouteLeft": _scaled(e.route_left, 1e-3) if known else None,
+            "RANGE_BatteryEndsAfter": _scaled(e.battery_ends_after, 1e-3) if known else None,
+            "RANGE_RouteState": e.route_state,
+            **_why(e.why if known else None),
         }
-        distrusted = sum(bit for role, bit in self._sensor_bits if role in e.distrusted)
-        out = []
-        for name, values in frames.items():
-            encoder = self._encoders[name]
-            out.append(encoder.frame(encoder.pack(values, distrusted if name == "RANGE_Sensors" else 0), time_ns))
-        return out
+        counted = ((f"RANGE_Count{name.capitalize()}", count) for name, count in vars(counts).items())
+        values |= {signal: min(count, self.greatest(signal)) for signal, count in counted}
+        values |= {signal: 1 for role in e.distrusted if (signal := sensor_signal(role)) in self._fields}
+        return self._frames(self._pack(values, [name for name in self.messages if name != STATUS]), time_ns)
 
     def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
         """The frame of every tenth of a second. `estimate` may not be changed afterwards: it is packed once."""
-        if estimate is not self._packed[0]:
-            self._packed = estimate, self._pack_status(estimate)
-        return [self._encoders["RANGE_Status"].frame(self._packed[1], time_ns)]
+        if estimate is not self._status[0]:
+            state = self.reported(estimate)[0]
+            soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
+            if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
+                soc = sigma = None  # neither is of use without the other
+            values = {SOC: soc, SIGMA: sigma, "RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
+            values |= {reason_signal(reason): 1 for reason in estimate.reasons}
+            self._status = estimate, self._pack(values, [STATUS])
+        return self._frames(self._status[1], time_ns)
 
-    def _pack_status(self, estimate: Estimate) -> int:
-        state = self.reported(estimate)[0]
-        soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
-        if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
-            soc = sigma = None  # neither is of use without the other
-        values = {SOC: soc, SIGMA: sigma, "RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
-        reasons = int(estimate.reasons)
-        bits = sum(bit for reason, bit in self._reason_bits if reasons & reason)
-        return self._encoders["RANGE_Status"].pack(values, bits)
+    def _pack(self, values: Mapping[str, float | None], messages: Iterable[str]) -> dict[str, int]:
+        """The bits of `messages` without counter and checksum; signals that `values` leaves out are 0."""
+        words = {name: self._encoders[name].blank for name in messages}
+        for signal, value in values.items():
+            field = self._fields[signal]
+            words[field.message] |= field.bits(value)
+        return words
+
+    def _frames(self, words: Mapping[str, int], time_ns: int) -> list[Frame]:
+        return [self._encoders[name].frame(word, time_ns) for name, word in words.items()]
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
@@ -178,7 +153,7 @@ class Publisher:
         return self._fields[signal].raw(value) is not None
 
 
-SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
+STATUS, SOC, SIGMA = "RANGE_Status", "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
 KNOWN = (State.VALID, State.DEGRADED)
 """The states in which numbers are sent."""
 
@@ -259,7 +234,7 @@ def _signal_problem(signal: Signal, model: Signal) -> str:
             return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
         if signal.length < 8:
             return f"needs 8 bits or more for the code 'not available', has {signal.length}"
-        missing = [value for value in (0, 100 if model.name == SOC else 0) if _field(signal).raw(value) is None]
+        missing = [value for value in (0, 100 if model.name == SOC else 0) if _Field(signal, "").raw(value) is None]
         return f"must be able to say {missing[0]} {unit}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
@@ -267,17 +242,17 @@ def _signal_problem(signal: Signal, model: Signal) -> str:
     return "" if is_whole else f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
 
 
-@dataclass(frozen=True, slots=True)
 class _Field:
     """The place of a signal in its message, an integer of the first seven bytes, and its raw values."""
 
-    shift: int
-    mask: int
-    low: float
-    high: float
-    offset: float
-    scale: float
-    absent: int
+    def __init__(self, signal: Signal, message: str) -> None:
+        first = first_bit(signal)
+        self.message = message
+        self.low, self.high = raw_range(signal, not_available=True)
+        self.scale, self.offset = float(signal.conversion.scale), float(signal.conversion.offset)
+        self.mask = (1 << int(signal.length)) - 1
+        self.absent = self.mask // 2 + 1 if signal.is_signed else self.mask
+        self.shift = first if signal.byte_order == "little_endian" else 56 - first - signal.length
 
     def raw(self, value: float | None) -> int | None:
         """The nearest raw value; None if `value` is unknown, not finite, or outside the range of the signal."""
@@ -292,48 +267,23 @@ class _Field:
         return (self.absent if raw is None else raw & self.mask) << self.shift
 
 
-@dataclass(slots=True)
 class _Encoder:
-    """Packs one message. cantools would take five times as long."""
+    """Completes the frames of one message. cantools would take five times as long."""
 
-    identifier: int
-    order: Literal["little", "big"]
-    blank: int  # ones in unused bits; signals that are not ours are not available
-    fields: dict[str, _Field]  # ours, but for counter and CRC
-    counter_shift: int
-    counts: int
-    counter: int = 0  # of the next frame, below `counts`
-
-    def pack(self, values: Mapping[str, float | None], flags: int = 0) -> int:
-        """The signals at their places, without counter. flags: the bits of the fields that `values` leaves out."""
-        word = self.blank | flags
-        for name, value in values.items():
-            word |= self.fields[name].bits(value)
-        return word
+    def __init__(self, message: Message, identifier: int) -> None:
+        fields = {s.name: _Field(s, message.name) for s in message.signals if not s.name.endswith("CRC")}
+        self.blank = 2**56 - 1  # ones in unused bits; signals that are not ours are not available
+        for name, field in fields.items():
+            self.blank &= ~(field.mask << field.shift)
+            self.blank |= 0 if name.startswith("RANGE_") else field.absent << field.shift
+        self._identifier, self._counter_field = identifier, fields.pop(f"{message.name}Counter")
+        self._is_little = message.signals[0].byte_order == "little_endian"
+        self._counter = 0  # of the next frame
+        self.fields = fields
 
     def frame(self, word: int, time_ns: int) -> Frame:
-        """The next frame, of a word from `pack`."""
-        data = (word | self.counter << self.counter_shift).to_bytes(7, self.order)
-        self.counter = (self.counter + 1) % self.counts
-        return time_ns, self.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
-
-
-def _field(signal: Signal) -> _Field:
-    first = first_bit(signal)
-    low, high = raw_range(signal, not_available=True)
-    mask = 2**signal.length - 1
-    absent = 2 ** (signal.length - 1) if signal.is_signed else mask
-    shift = first if signal.byte_order == "little_endian" else 56 - first - signal.length
-    return _Field(shift, mask, low, high, float(signal.conversion.offset), float(signal.conversion.scale), absent)
-
-
-def _encoder(message: Message, identifier: int) -> _Encoder:
-    fields = {signal.name: _field(signal) for signal in message.signals if not signal.name.endswith("CRC")}
-    blank = 2**56 - 1
-    for name, field in fields.items():
-        blank &= ~(field.mask << field.shift)
-        if not name.startswith("RANGE_"):
-            blank |= field.absent << field.shift
-    counter = fields.pop(f"{message.name}Counter")
-    order: Literal["little", "big"] = "little" if message.signals[0].byte_order == "little_endian" else "big"
-    return _Encoder(identifier, order, blank, fields, counter.shift, int(counter.high) + 1)
+        """The next frame, whose signals have the bits of `word`."""
+        word |= self._counter << self._counter_field.shift
+        self._counter = (self._counter + 1) % (int(self._counter_field.high) + 1)
+        data = word.to_bytes(7, "little" if self._is_little else "big")
+        return time_ns, self._identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED

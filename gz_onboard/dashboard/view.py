@@ -88,7 +88,7 @@ class View:
             period = (message.cycle_time or PERIODS_MS.get(name, 1000)) / 1000
             self.messages[name] = ReceivedMessage(message, period, limits)
             self._of_signal |= dict.fromkeys(limits, self.messages[name])
-        self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent().items()}
+        self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent.items()}
         self._seen_sensors = Reason(0)  # by their reasons, the sensors that have worked since the daemon started
         self._ranges: dict[int, float | None] = {}  # km, by the number of the step of `TREND_STEP`
 
