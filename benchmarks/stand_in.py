@@ -34,7 +34,7 @@ def install(receive_port: int, send_port: int, library: bool) -> None:
         importlib.import_module("gz_onboard.bus._can")  # python-can without what makes it large
         module = importlib.import_module("can.interfaces.socketcan.socketcan")
     else:
-        module = importlib.import_module("gz_onboard.bus.socketcan")
+        module = importlib.import_module("gz_onboard.bus.channel")
 
     def create() -> socket.socket:
         return StandIn(socket.AF_INET, socket.SOCK_DGRAM)

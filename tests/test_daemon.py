@@ -29,8 +29,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
+from gz_onboard.bus._can import LibraryBus
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.library_bus import LibraryBus
 from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary

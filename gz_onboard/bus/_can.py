@@ -1,4 +1,4 @@
-"""Import python-can without asammdf: use ``from gz_onboard.bus._can import can`` on board.
+"""A bus of any of python-can's interfaces, and python-can itself: ``from gz_onboard.bus._can import can``.
 
 Where asammdf is installed, ``import can`` loads it for its MF4 reader, and with it pandas: 86 MB and 0.9 s that
 a daemon which never reads an MF4 file would pay at each start.
@@ -10,10 +10,14 @@ import importlib
 import os
 import socket
 import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 from gz_onboard.imports import require
 
 
@@ -32,8 +36,9 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["can", "check_interface", "flagged", "open_bus"]
+__all__ = ["LibraryBus", "can", "check_interface", "flagged", "open_bus"]
 
+MAX_ECHOES = 200  # frames of our own that may not have come back yet
 MULTICAST = "udp_multicast"
 ALL_GROUPS = {
     socket.AF_INET: (socket.IPPROTO_IP, 49),
@@ -68,3 +73,73 @@ def flagged(message: can.Message) -> int:
     """The identifier of a message with the kernel's flags."""
     identifier = message.arbitration_id | (EFF_FLAG if message.is_extended_id else 0)
     return identifier | (RTR_FLAG if message.is_remote_frame else 0) | (ERR_FLAG if message.is_error_frame else 0)
+
+
+@contextmanager
+def _os_errors() -> Iterator[None]:
+    """Turn python-can's errors within into OSError; of interfaces that it cannot make, leave them."""
+    try:
+        yield
+    except can.CanInterfaceNotImplementedError:
+        raise
+    except can.CanError as error:
+        code = error.error_code
+        raise (OSError(str(error)) if code is None else OSError(code, str(error))) from error
+
+
+class LibraryBus:
+    """An open bus. InputError for an unknown interface, OSError for a bus that is down.
+
+    identifiers: the only ones to be received, if given; options: for python-can.
+    """
+
+    def __init__(
+        self, interface: str, channel: str, identifiers: Sequence[int] | None, options: Mapping[str, Any]
+    ) -> None:
+        check_interface(interface)
+        self.overflow = 0
+        self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
+        self._echoing = interface == MULTICAST or bool(options.get("receive_own_messages"))
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=MAX_ECHOES)  # frames of our own that will come back
+        try:
+            with _os_errors():
+                self._bus: Any = open_bus(interface, channel, **options)
+        except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
+            raise InputError(f"--interface {interface}: {error}") from error
+
+    def drain(self, frames: list[Frame], index: int, limit: int, until: float) -> bool:
+        """Append the waiting frames, at most `limit`, until a monotonic time [s]; whether more may be waiting."""
+        for _ in range(limit):
+            if time.monotonic() > until:
+                break
+            with _os_errors():
+                message = self._bus.recv(0)
+            if message is None:
+                return False
+            identifier, data = flagged(message), bytes(message.data)
+            # Filtered here: with filters of its own python-can's recv(0) returns None for each frame it rejects.
+            unwanted = self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted
+            if not unwanted and not self._is_echo(identifier, data):
+                # Only the kernel's time stamps share a clock; other interfaces have clocks of their own.
+                frames.append((time.time_ns(), identifier, data, index))
+        return True
+
+    def _is_echo(self, identifier: int, data: bytes) -> bool:
+        """Whether that is a frame of our own, which comes back once."""
+        if (identifier, data) not in self._sent:
+            return False
+        self._sent.remove((identifier, data))
+        return True
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send a frame. OSError if the bus does not take it now."""
+        extended = bool(identifier & EFF_FLAG)
+        with _os_errors():
+            self._bus.send(can.Message(arbitration_id=identifier & 0x1FFFFFFF, data=data, is_extended_id=extended))
+        if self._echoing:
+            self._sent.append((identifier, data))
+
+    def close(self) -> None:
+        """Shut the bus down. OSError."""
+        with _os_errors():
+            self._bus.shutdown()

@@ -219,7 +219,7 @@ def _by_channel(senders: list[Send]) -> Send:
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
     from gz_onboard.bus._can import can, check_interface, open_bus
-    from gz_onboard.bus.socketcan import NO_SOCKETS
+    from gz_onboard.bus.channel import NO_SOCKETS
 
     check_interface(interface)
     if not names:
