@@ -12,7 +12,6 @@ from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
-from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC, location_row
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 ESTIMATE_TOPIC = "/estimate"
 STATUS_TOPIC = "/status"
 WHY_TOPIC, CHANGE_TOPIC = "/why", "/range_change"
+LOCATION_TOPIC, BATTERY_ENDS_TOPIC = "/location", "/battery_ends"
 COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures", "log_lost", "unknown_others")
 ESTIMATE_UNITS = {
     "time": "s since the first frame",
@@ -73,6 +73,22 @@ RIDE_UNITS = {
     "ambient_temperature": "degC",
 }
 """Of the numbers of `ride_row`."""
+_NUMBER: dict[str, Any] = {"type": "number"}
+LOCATION_SCHEMA: dict[str, Any] = {
+    "title": "foxglove.LocationFix",
+    "type": "object",
+    "properties": {
+        "timestamp": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
+        "frame_id": {"type": "string"},
+        "latitude": _NUMBER | {"description": "deg"},
+        "longitude": _NUMBER | {"description": "deg"},
+        "altitude": _NUMBER | {"description": "m, not there if it is not known"},
+        "position_covariance": {"type": "array", "items": _NUMBER, "minItems": 9, "maxItems": 9},
+        "position_covariance_type": {"type": "integer", "description": "0: not known"},
+    },
+    "required": ["timestamp", "frame_id", "latitude", "longitude", "position_covariance", "position_covariance_type"],
+}
+"""Foxglove's well-known schema of a satellite fix."""
 TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
 
 
@@ -150,6 +166,19 @@ def learned_row(learned: Mapping[str, Learned]) -> dict[str, dict[str, float]]:
         name: {"factor": round(x.value, 4), "sd": round(x.sd, 4), "share": round(x.share, 3)}
         for name, x in learned.items()
     }
+
+
+def location_row(time_ns: int, frame: str, latitude: float, longitude: float, altitude: float | None) -> dict[str, Any]:
+    """Return a position [deg, m] of `time_ns` as ``foxglove.LocationFix``; frame: name of the object."""
+    row = {
+        "timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9},
+        "frame_id": frame,
+        "latitude": round(latitude, 7),
+        "longitude": round(longitude, 7),
+        "position_covariance": [0.0] * 9,
+        "position_covariance_type": 0,  # not known: no receiver on our buses says how good its position is
+    }
+    return row if altitude is None else row | {"altitude": round(altitude, 2)}
 
 
 class Positions:

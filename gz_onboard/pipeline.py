@@ -21,10 +21,11 @@ from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, WINDOW, Estimate, Frame, Reason, State, hexadecimal
-from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_TOPIC, location_row
 from gz_onboard.log_rows import (
+    BATTERY_ENDS_TOPIC,
     CHANGE_TOPIC,
     ESTIMATE_TOPIC,
+    LOCATION_TOPIC,
     STATUS_TOPIC,
     WHY_TOPIC,
     Log,
@@ -33,6 +34,7 @@ from gz_onboard.log_rows import (
     estimate_row,
     explanation_row,
     learned_row,
+    location_row,
     reason_names,
     ride_row,
 )

@@ -281,7 +281,7 @@ def watch(line: Line, interface: str, dashboard: list[str], replay: list[str]) -
             break
         if now - shown_at > 1.0:
             shown_at = now
-            line.show(*(view.value(f"RANGE_Remaining{what}", now) for what in ("", "P10", "P90")))
+            line.show(*view.picture(now, CHANNEL, interface, channel.up)["range"].values())
     channel.close()
     os.kill(os.getpid(), signal.SIGTERM)
 

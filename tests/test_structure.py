@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["arrays", "background", "constants", "errors", "events", "location_rows", "notify", "progress", "state"],
+    ["arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
     ["imports", "options"],
     ["toml", "routes"],
     ["bus", "physics"],

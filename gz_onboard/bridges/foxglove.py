@@ -3,29 +3,47 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
-from gz_onboard import notify
-from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.constants import WH
-from gz_onboard.dashboard.command import add_source, channel_of, view_of
-from gz_onboard.dashboard.picture import Picture
-from gz_onboard.dashboard.pictures import pictures, until_signalled
-from gz_onboard.dashboard.server import host_and_port
+from gz_onboard.dashboard.live import add_source, host_and_port, live, report, view_of
+from gz_onboard.dashboard.vehicle_frames import POSITION_ROLES
+from gz_onboard.dashboard.view import Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError, writing
-from gz_onboard.events import Frame, RouteState
+from gz_onboard.events import RouteState
 from gz_onboard.imports import require
-from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
-from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
+from gz_onboard.log_rows import (
+    ESTIMATE_TOPIC,
+    ESTIMATE_UNITS,
+    LOCATION_SCHEMA,
+    LOCATION_TOPIC,
+    estimate_schema,
+    location_row,
+)
 from gz_onboard.vehicle import read_vehicle
 
 LISTEN = "127.0.0.1:8765"
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
-UNKNOWN = "UNKNOWN"  # state or activity that no range frame says
+ESTIMATE = {
+    "soc": ("battery.soc_percent", 0.01),
+    "soc_sd": ("battery.soc_sigma_percent", 0.01),
+    "range": ("range.km", 1e3),
+    "range_p10": ("range.p10_km", 1e3),
+    "range_p90": ("range.p90_km", 1e3),
+    "energy_left": ("battery.energy_left_wh", WH),
+    "consumption_recent": ("consumption.recent_wh_per_km", WH / 1e3),
+    "consumption_expected": ("consumption.expected_wh_per_km", WH / 1e3),
+    "charge_power": ("charge.power_w", 1.0),
+    "time_to_full": ("charge.time_to_full_min", 60.0),
+    "range_full": ("charge.range_full_km", 1e3),
+    "route_left": ("route.left_km", 1e3),
+    "arrival_soc": ("route.arrival_soc_percent", 0.01),
+    "arrival_soc_p10": ("route.arrival_soc_p10_percent", 0.01),
+    "battery_ends_after": ("route.battery_ends_after_km", 1e3),
+}
+"""Numbers of an estimate in a log: the place in a picture, and how many SI units its unit has."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,83 +64,48 @@ def run(arguments: argparse.Namespace) -> int:
     require("foxglove")
     import foxglove
 
+    say, context = partial(report, "foxglove"), foxglove.Context()
     host, port = host_and_port(arguments.listen)
-    view = view_of(arguments)
-    context = foxglove.Context()
     estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
-    positions = _positions(arguments.vehicle) if arguments.vehicle else None
-    places = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context) if positions else None
-
-    def show_positions(frames: Sequence[Frame]) -> None:
-        if positions and places:
-            for row in positions.take(frames):
-                places.log(_json(row), log_time=time.time_ns())
-
-    others = positions.identifiers if positions else ()
-    with channel_of(arguments, view, others) as channel, until_signalled(arguments.duration) as stopped:
+    places = None
+    if arguments.vehicle:
+        vehicle = read_vehicle(arguments.vehicle)
+        mapped = {source.role for source in vehicle.mapping.sources}
+        if missing := [role for role in POSITION_ROLES[:2] if role not in mapped]:
+            say(f"{vehicle.file}: [roles] has no {' and no '.join(missing)}: no position is shown")
+        else:
+            places = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context)
+    view = view_of(arguments, positions=places is not None)
+    with live(view, arguments) as pictures:
+        source = f"{arguments.channel} ({arguments.interface})"
         try:
             server = foxglove.start_server(
-                name=f"gz-onboard {channel.name}", host=host, port=port, capabilities=[], context=context
+                name=f"gz-onboard {arguments.channel}", host=host, port=port, capabilities=[], context=context
             )
         except RuntimeError as error:  # the address cannot be used
             raise InputError(f"--listen {arguments.listen}: {error}") from error
-        try:
-            address = f"[{host}]" if ":" in host else host
-            _say(f"ws://{address}:{server.port} shows {channel.name} ({channel.interface})")
-            for new in pictures(view, channel, stopped, show_positions):
-                estimates.log(_json(row_of(new)), log_time=time.time_ns())
-        finally:
-            notify.stopping()
-            server.stop()
+        say(f"ws://{f'[{host}]' if ':' in host else host}:{server.port} shows {source}")
+        shown_ns = 0
+        for picture in pictures:
+            estimates.log(encoded(estimate_of(picture)), log_time=time.time_ns())
+            if places and (here := picture["position"]) and here["time_ns"] != shown_ns:
+                shown_ns = here["time_ns"]
+                places.log(encoded(location_row(frame="gps", **here)), log_time=time.time_ns())
+        server.stop()
     return OK
 
 
-def _positions(name: str) -> LivePositions | None:
-    """The positions of the vehicle `name`, if its file maps them."""
-    vehicle = read_vehicle(name)
-    if missing := LivePositions.lacking(vehicle):
-        _say(f"{vehicle.file}: [roles] has no {' and no '.join(missing)}: no position is shown")
-        return None
-    return LivePositions(vehicle)
-
-
-def _say(text: str) -> None:
-    if sys.stdout is not None:
-        print(f"foxglove: {text}", flush=True)
-    notify.ready(text)
-
-
-def _json(row: Mapping[str, object]) -> bytes:
-    return json.dumps(row, separators=(",", ":"), allow_nan=False).encode()
-
-
-def row_of(picture: Picture) -> dict[str, object]:
+def estimate_of(picture: Picture) -> dict[str, object]:
     """Convert a picture to an estimate as in logs: SI units, None for numbers that are stale or in no range frame."""
-    charge, route, battery = picture.charge, picture.route, picture.battery
-    numbers = {
-        "soc": (battery.soc_percent, 0.01),
-        "soc_sd": (battery.soc_sigma_percent, 0.01),
-        "range": (picture.range.km, 1e3),
-        "range_p10": (picture.range.p10_km, 1e3),
-        "range_p90": (picture.range.p90_km, 1e3),
-        "energy_left": (battery.energy_left_wh, WH),
-        "consumption_recent": (picture.consumption.recent_wh_per_km, WH / 1e3),
-        "consumption_expected": (picture.consumption.expected_wh_per_km, WH / 1e3),
-        "charge_power": (charge.power_w if charge else None, 1.0),
-        "time_to_full": (charge.time_to_full_min if charge else None, 60.0),
-        "range_full": (charge.range_full_km if charge else None, 1e3),
-        "route_left": (route.left_km if route else None, 1e3),
-        "arrival_soc": (route.arrival_soc_percent if route else None, 0.01),
-        "arrival_soc_p10": (route.arrival_soc_p10_percent if route else None, 0.01),
-        "battery_ends_after": (route.battery_ends_after_km if route else None, 1e3),
-    }
     row: dict[str, object] = dict.fromkeys(ESTIMATE_UNITS)
-    row |= {name: value if value is None else float(f"{value * unit:.7g}") for name, (value, unit) in numbers.items()}
-    on = RouteState.NONE if route is None else RouteState.ON if route.on_route else RouteState.OFF
+    for name, (path, unit) in ESTIMATE.items():
+        value = value_at(picture, path)
+        row[name] = None if value is None else float(f"{value * unit:.7g}")
+    on_route = value_at(picture, "route.on_route")
     return row | {
-        "state": (picture.state or UNKNOWN).upper(),
-        "reasons": " ".join(picture.reasons).upper(),
-        "activity": (picture.activity or UNKNOWN).upper(),
-        "route_state": on.name,
-        "distrusted": " ".join(picture.distrusted),
+        "state": (picture["state"] or "unknown").upper(),
+        "reasons": " ".join(picture["reasons"]).upper(),
+        "activity": (picture["activity"] or "unknown").upper(),
+        "route_state": (RouteState.NONE if on_route is None else RouteState.ON if on_route else RouteState.OFF).name,
+        "distrusted": " ".join(picture["distrusted"]),
     }

@@ -1,4 +1,8 @@
-"""``gz-onboard mqtt``: publish the range on an MQTT broker, in a form that Home Assistant discovers."""
+"""``gz-onboard mqtt``: publish the range on an MQTT broker, in a form that Home Assistant discovers.
+
+One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, without values, so that
+the broker keeps no number of a vehicle that is gone.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +10,81 @@ import argparse
 import math
 import re
 import socket
-import sys
 import time
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from gz_onboard import notify
-from gz_onboard.bridges import home_assistant
-from gz_onboard.dashboard.command import add_source, channel_of, view_of
-from gz_onboard.dashboard.picture import Picture, picture
-from gz_onboard.dashboard.pictures import clock, pictures, until_signalled
-from gz_onboard.dashboard.view import View
+from gz_onboard import __version__, notify
+from gz_onboard.dashboard.live import add_source, live, report, view_of
+from gz_onboard.dashboard.view import ALERTS, Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError
+from gz_onboard.events import Activity, State
 from gz_onboard.imports import require
 
-if TYPE_CHECKING:
-    from gz_onboard.bridges.broker import Broker
+EVERY_S, AT_LEAST_S = 1.0, 10.0  # between two states at least, and at most where nothing has changed
+EXPIRES_S = 30  # after which the broker drops a state, and Home Assistant shows none
+LONGEST_STATE = 255  # characters that Home Assistant takes as a state
+PREFIX = "homeassistant"  # where it looks for discovery messages, unless it is configured otherwise
+NONE = "none"  # alert and reasons when all is well
 
-EVERY_S = 1.0  # at most so often, when something has changed
-AT_LEAST_S = 10.0  # though nothing has
+# Attributes of a sensor, as Home Assistant's MQTT discovery names them.
+_Attributes = dict[str, Any]
+_NUMBER: _Attributes = {"state_class": "measurement", "suggested_display_precision": 0}
+_KM = _NUMBER | {"device_class": "distance", "unit_of_measurement": "km", "suggested_display_precision": 1}
+_CELL = _NUMBER | {"device_class": "temperature", "unit_of_measurement": "°C"}
+_CHARGE = _NUMBER | {"device_class": "battery", "unit_of_measurement": "%"}
+_CONSUMPTION = _NUMBER | {"device_class": "energy_distance", "unit_of_measurement": "Wh/km"}
+_ENUM = {"device_class": "enum"}
+_DIAGNOSTIC = {"entity_category": "diagnostic"}
+_SIGMA = {"unit_of_measurement": "%", "suggested_display_precision": 1}
+
+SENSORS: dict[str, tuple[str, _Attributes]] = {
+    "range": ("range.km", _KM | {"name": "Range"}),
+    "range_p10": ("range.p10_km", _KM | {"name": "Range, surely (P10)"}),
+    "range_p90": ("range.p90_km", _KM | {"name": "Range, at best (P90)"}),
+    "state_of_charge": ("battery.soc_percent", _CHARGE | {"name": "State of charge"}),
+    "state_of_charge_sigma": (
+        "battery.soc_sigma_percent",
+        _NUMBER | _SIGMA | _DIAGNOSTIC | {"name": "State of charge, sigma"},
+    ),
+    "energy_left": (
+        "battery.energy_left_wh",
+        _NUMBER | {"name": "Energy left", "device_class": "energy_storage", "unit_of_measurement": "Wh"},
+    ),
+    "consumption_recent": (
+        "consumption.recent_wh_per_km",
+        _CONSUMPTION | {"name": "Consumption of the last kilometre", "suggested_display_precision": 1},
+    ),
+    "consumption_expected": (
+        "consumption.expected_wh_per_km",
+        _CONSUMPTION | {"name": "Consumption expected", "suggested_display_precision": 1},
+    ),
+    "charge_power": (
+        "charge.power_w",
+        _NUMBER | {"name": "Charging power", "device_class": "power", "unit_of_measurement": "W"},
+    ),
+    "time_to_full": (
+        "charge.time_to_full_min",
+        _NUMBER | {"name": "Time until full", "device_class": "duration", "unit_of_measurement": "min"},
+    ),
+    "range_full": ("charge.range_full_km", _KM | {"name": "Range when full"}),
+    "route_left": ("route.left_km", _KM | {"name": "Distance to the destination"}),
+    "arrival_state_of_charge": ("route.arrival_soc_percent", _CHARGE | {"name": "State of charge on arrival"}),
+    "rated_range": ("rated_km", _KM | {"name": "Rated range"}),
+    "odometer": (  # only grows, so that Home Assistant can sum days and months
+        "odometer_km",
+        _KM | {"name": "Odometer", "state_class": "total_increasing", "suggested_display_precision": 0},
+    ),
+    "cell_temperature_coldest": ("cells.coldest_degc", _CELL | {"name": "Coldest cell"}),
+    "cell_temperature_hottest": ("cells.hottest_degc", _CELL | {"name": "Hottest cell"}),
+    "activity": ("activity", _ENUM | {"name": "Activity", "options": [a.name.lower() for a in Activity]}),
+    "state": ("state", _ENUM | {"name": "State of the estimate", "options": [s.name.lower() for s in State]}),
+    "alert": ("alerts", _ENUM | {"name": "Alert", "options": [NONE, *ALERTS]}),
+    "reasons": ("reasons", _DIAGNOSTIC | {"name": "Reasons"}),
+}
+"""By their names in the state: the place in a picture, and the attributes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,58 +102,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard mqtt``: 0 when it is ended. InputError for bad options; the broker may be away."""
     require("paho")
-    from gz_onboard.bridges.broker import Address, Broker
+    from gz_onboard.bridges.broker import Broker, read_login
 
     name = arguments.name or re.sub(r"[^\w-]+", "-", socket.gethostname(), flags=re.ASCII) or "scooter"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
         raise InputError(f"--name {name}: must be of letters, digits, - and _, at most 64")
-    address = Address.of(arguments.broker, arguments.tls, arguments.login)
-    view = view_of(arguments, own_frames=True)
-    with channel_of(arguments, view) as channel, until_signalled(arguments.duration) as stopped:
-        unknown = picture(View(view.source), clock(), (channel.name, channel.interface), False)
-        offline = home_assistant.encoded(home_assistant.state_of(unknown, home_assistant.OFFLINE))
-        broker = Broker(address, name, (home_assistant.topic_of(name), offline), _say)
-        bridge = Bridge(broker, name)
+    topic, login = topic_of(name), read_login(arguments.login)
+    will = topic, encoded({"status": "offline"} | dict.fromkeys(SENSORS))
+    broker = Broker(arguments.broker, name, will, partial(report, "mqtt"), tls=arguments.tls, login=login)
+    with live(view_of(arguments, own_frames=True), arguments) as pictures, closing(broker):
         broker.start()
-        notify.ready(f"{channel.name} ({channel.interface}) to {address} as {name}")
-        try:
-            for new in pictures(view, channel, stopped):
-                bridge.show(new, time.monotonic())
-        finally:
-            notify.stopping()
-            broker.close()
+        notify.ready(f"{arguments.channel} ({arguments.interface}) to {broker} as {name}")
+        announced, sent, sent_at = 0, None, -math.inf
+        for picture in pictures:
+            now, connections, state = time.monotonic(), broker.connections, state_of(picture)
+            if announced != connections:  # the broker may have lost everything
+                about = encoded(discovery(name))
+                if broker.publish(f"{PREFIX}/device/gz-onboard-{name}/config", about):
+                    announced, sent_at = connections, -math.inf
+            due = now - sent_at >= (AT_LEAST_S if state == sent else EVERY_S)
+            if due and broker.publish(topic, encoded(state), EXPIRES_S):
+                sent, sent_at = state, now
     return OK
 
 
-def _say(text: str) -> None:
-    if sys.stdout is not None:
-        print(f"mqtt: {text}", flush=True)
-    notify.status(text)
+def topic_of(name: str) -> str:
+    """Topic of the state of the vehicle `name`."""
+    return f"gz-onboard/{name}/state"
 
 
-class Bridge:
-    """Publishes pictures: each change within a second, an unchanged one every `AT_LEAST_S`."""
+def state_of(picture: Picture) -> dict[str, Any]:
+    """Return the values of a picture by name; None if stale, not available or never received."""
+    state = {key: value_at(picture, path) for key, (path, _) in SENSORS.items()}
+    reasons = picture["reasons"]
+    while len(text := ", ".join(reasons)) > LONGEST_STATE:
+        reasons = reasons[:-1]
+    state |= {"alert": next(iter(picture["alerts"]), NONE), "reasons": (text or NONE) if picture["state"] else None}
+    return {"status": "online"} | state
 
-    def __init__(self, broker: Broker, name: str) -> None:
-        self._broker = broker
-        self._name = name
-        self._announced = 0  # to which of the broker's connections the device was announced
-        self._sent: dict[str, object] | None = None
-        self._time = -math.inf
 
-    def show(self, new: Picture, now: float) -> None:
-        """Publish `new` if it is due at `now` [s]."""
-        broker, number = self._broker, self._broker.connections
-        if not broker.connected:
-            return
-        if number != self._announced:
-            about = home_assistant.encoded(home_assistant.discovery(self._name))
-            if not broker.publish(home_assistant.discovery_topic(self._name), about):
-                return
-            self._announced, self._sent, self._time = number, None, -math.inf
-        state = home_assistant.state_of(new, home_assistant.ONLINE)
-        if now - self._time < (AT_LEAST_S if state == self._sent else EVERY_S):
-            return
-        payload = home_assistant.encoded(state)
-        if broker.publish(home_assistant.topic_of(self._name), payload, home_assistant.EXPIRES_S):
-            self._sent, self._time = state, now
+def discovery(name: str) -> dict[str, Any]:
+    """Return the discovery message for the vehicle `name`: one device with its sensors.
+
+    A sensor is available only while the bridge is online and the value is known.
+    """
+    topic, components = topic_of(name), {}
+    for key, (_, attributes) in SENSORS.items():
+        there = f"value_json.status == 'online' and value_json.{key} is not none"
+        components[key] = attributes | {
+            "platform": "sensor",
+            "unique_id": f"gz-onboard-{name}-{key}",
+            "value_template": f"{{{{ value_json.{key} }}}}",
+            "availability": [{"topic": topic, "value_template": f"{{{{ 'online' if {there} else 'offline' }}}}"}],
+            "expire_after": EXPIRES_S,
+        }
+    return {
+        "device": {"identifiers": [f"gz-onboard-{name}"], "name": name, "manufacturer": "gz_onboard"},
+        "origin": {"name": "gz-onboard", "sw_version": __version__},
+        "state_topic": topic,
+        "components": components,
+    }

@@ -1,6 +1,7 @@
-"""The vehicle's own frames on the page: speed, cell temperatures, odometer and the distance ridden today.
+"""Values from the vehicle's own frames, which the range frames do not have.
 
-The range frames do not have these. The frames are read by the vehicle's DBC files, as the daemon reads them.
+Speed, cell temperatures, odometer, distance ridden today and position. The frames are decoded by the vehicle's DBC
+files, as the daemon decodes them.
 """
 
 from __future__ import annotations
@@ -12,18 +13,20 @@ from collections.abc import Container
 from dataclasses import replace
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
-from gz_onboard.dashboard import LATE_PERIODS
-from gz_onboard.estimator.signals import STEP_LIMITS, SelfReported
+from gz_onboard.estimator.signals import FIX_2D, FIX_3D, STEP_LIMITS, SelfReported
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
+LATE_PERIODS = 3  # of a message, after which its values are shown in grey; after STALE_PERIODS they are not shown
 CELLS, ODOMETER = "cell_temperature", "odometer"
 CELL_ROLES = "coldest_cell_temperature", CELLS, "hottest_cell_temperature"
+POSITION_ROLES = "latitude", "longitude", "gps_altitude", "gps_fix"
 PERIOD_S = 1.0  # where the vehicle file gives none
 SHORTEST_PERIOD_S = 0.1  # the bus is read every twentieth of a second, however often a message comes
 RIDING_DEGC = -20.0, 60.0  # usual in data sheets of lithium-ion cells; where the vehicle file says nothing
@@ -31,41 +34,47 @@ CHARGING_DEGC = 0.0, 45.0  # likewise
 LONGEST_DAY_M = 86_400 * STEP_LIMITS[ODOMETER][2]
 CLOCK_SET_NS = 10**18  # since 1970; an earlier time is of a board whose clock was not set
 
+UNKNOWN: dict[str, Any] = dict.fromkeys(("cells", "speed_km_h", "odometer_km", "ridden_today_km"))
+"""What `VehicleFrames.values` gives before any frame."""
+
 
 class VehicleFrames:
-    """The latest values of the vehicle's own frames that are shown.
+    """The latest values of the vehicle's own frames.
 
     No clock: times [s, monotonic] come with the frames, and the day is that of their time stamps. day_file: keeps where
-    the day began; it need not exist yet.
+    the day began; it need not exist yet. positions: also read where the vehicle is.
     """
 
-    def __init__(self, vehicle: Vehicle, day_file: Path | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, day_file: Path | None = None, *, positions: bool = False) -> None:
         mapping, p = vehicle.mapping, vehicle.parameters
         factors = speed_factors(p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"])
-        roles = {source.role for source in mapping.sources}
-        self._speed = next(((role, factor) for role, factor in factors.items() if role in roles), ("", 0.0))
+        mapped = {source.role for source in mapping.sources}
+        self._speed = next(((role, factor) for role, factor in factors.items() if role in mapped), ("", 0.0))
         # A frame with the same identifier of another vehicle is recognised by its checksum: values are shown only while
         # the checksums of one message, the rarest that has any, are right.
         protected = [name for name, protection in mapping.protection.items() if protection.crc]
         self._witness = max(protected, key=lambda name: mapping.periods.get(name, 0.0), default="")
         self._witnessed = 0
-        shown = {*CELL_ROLES, ODOMETER, self._speed[0]}
+        roles = {*CELL_ROLES, ODOMETER, self._speed[0], *(POSITION_ROLES if positions else ())}
         witness = [source for source in mapping.sources if source.message == self._witness][:1]
-        sources = [source for source in mapping.sources if source.role in shown or source in witness]
-        sources += [source for source in mapping.instruments if source.role in shown]
+        sources = [source for source in mapping.sources if source.role in roles or source in witness]
+        sources += [source for source in mapping.instruments if source.role in roles]
         self.identifiers = identifiers_of(mapping, {source.message for source in sources})
-        self._limits = cell_limits(vehicle.derating)
         self._codec = Codec(replace(mapping, sources=tuple(sources)))
         self._period = {
             role: max(group.period or PERIOD_S, SHORTEST_PERIOD_S)
             for group in self._codec.groups
             for role in group.roles
         }
-        self._last: dict[str, tuple[float, float]] = {}  # by role: value, time
+        self._latest: dict[str, tuple[float, float, int]] = {}  # by role: value, when it came [s], its stamp [ns]
         self._day = Day(day_file, vehicle.name)
+        self._positions = positions
+        riding = cell_limits(vehicle.derating)
+        self.riding_limits = riding  # degC, of the cells
+        self.charging_limits = max(riding[0], CHARGING_DEGC[0]), min(riding[1], CHARGING_DEGC[1])
 
     def take(self, frame: Frame, now: float) -> None:
-        """Take in a frame that came at `now`; others, and those that fail a check, are ignored."""
+        """Take a frame that came at `now`; others, and those that fail a check, are ignored."""
         self._codec.decode([frame])
         for window in self._codec.windows():
             group = self._codec.groups[window.group]
@@ -75,42 +84,41 @@ class VehicleFrames:
                 continue
             for role, samples in zip(group.roles, window.roles, strict=True):
                 if samples is not None and (role != ODOMETER or self._day.take(samples.value, frame[0], now)):
-                    self._last[role] = samples.value, now
+                    self._latest[role] = samples.value, now, frame[0]
 
-    def value(self, role: str, now: float, periods: float = STALE_PERIODS) -> float | None:
-        """The latest value of a role; None if it is older than `periods`, or never came."""
-        value, came = self._last.get(role, (0.0, -inf))
-        return value if now - came <= periods * self._period.get(role, PERIOD_S) else None
-
-    def cells(self, now: float) -> tuple[float, float] | None:
-        """Temperatures of the coldest and the hottest cell [degC]; None if unknown."""
-        known = [value for role in CELL_ROLES if (value := self.value(role, now)) is not None]
-        return (min(known), max(known)) if known else None
-
-    def speed(self, now: float, distrusted: Container[str]) -> float | None:
-        """Speed in whole km/h, as speedometers show it; None if unknown, or if the sensor is `distrusted`."""
-        role, factor = self._speed
-        value = None if role in distrusted else self.value(role, now)
-        return None if value is None else round(abs(value * factor) * 3.6)
-
-    def odometer(self, now: float) -> tuple[float | None, float | None]:
-        """Odometer, and distance ridden today [km]; None where unknown."""
-        metres = self.value(ODOMETER, now)
-        return (None, None) if metres is None else (metres / 1e3, self._day.ridden)
-
-    def late(self, now: float) -> tuple[str, ...]:
-        """`CELLS` and `ODOMETER` if their values are overdue, but not yet stale."""
-        overdue = {
-            role
-            for role in self._last
-            if self.value(role, now) is not None and self.value(role, now, LATE_PERIODS) is None
+    def values(self, now: float, distrusted: Container[str] = ()) -> dict[str, Any]:
+        """The values by their names in the picture; None if unknown, stale, or of a sensor that is `distrusted`."""
+        fresh = {
+            role: found[0] for role, found in self._latest.items() if self._periods_old(role, now) <= STALE_PERIODS
         }
-        return tuple(name for name, roles in ((CELLS, CELL_ROLES), (ODOMETER, (ODOMETER,))) if overdue & {*roles})
+        cells = [fresh[role] for role in CELL_ROLES if role in fresh and CELLS not in distrusted]
+        metres = None if ODOMETER in distrusted else fresh.get(ODOMETER)
+        role, factor = self._speed
+        speed = None if role in distrusted else fresh.get(role)
+        shown = {
+            "cells": {"coldest_degc": round(min(cells), 1), "hottest_degc": round(max(cells), 1)} if cells else None,
+            "speed_km_h": None if speed is None else round(abs(speed * factor) * 3.6),  # whole, as speedometers show it
+            "odometer_km": None if metres is None else round(metres / 1e3, 1),
+            "ridden_today_km": None if metres is None else self._day.ridden_km,
+        }
+        return shown | {"position": self._position(fresh)} if self._positions else shown
 
-    def limits(self, charging: bool) -> tuple[float, float]:
-        """Temperatures [degC] between which the cells should be."""
-        low, high = self._limits
-        return (max(low, CHARGING_DEGC[0]), min(high, CHARGING_DEGC[1])) if charging else (low, high)
+    def _position(self, fresh: dict[str, float]) -> dict[str, Any] | None:
+        """Where the vehicle is, and the time stamp [ns] of the longitude; None without a fix."""
+        fix = fresh.get("gps_fix", FIX_3D)
+        if fix < FIX_2D or not {"latitude", "longitude"} <= fresh.keys():
+            return None
+        altitude = fresh.get("gps_altitude") if fix >= FIX_3D else None
+        where = {"latitude": fresh["latitude"], "longitude": fresh["longitude"], "altitude": altitude}
+        return {"time_ns": self._latest["longitude"][2], **where}
+
+    def late(self, now: float) -> list[str]:
+        """`CELLS` and `ODOMETER` if their values are overdue, but not yet stale."""
+        overdue = {role for role in self._latest if LATE_PERIODS < self._periods_old(role, now) <= STALE_PERIODS}
+        return [name for name, roles in ((CELLS, CELL_ROLES), (ODOMETER, (ODOMETER,))) if overdue & {*roles}]
+
+    def _periods_old(self, role: str, now: float) -> float:
+        return (now - self._latest[role][1]) / self._period[role]
 
 
 def cell_limits(derating: Derating) -> tuple[float, float]:
@@ -122,38 +130,36 @@ def cell_limits(derating: Derating) -> tuple[float, float]:
 
 
 class Day:
-    """The distance ridden on the day of the last frame, by the odometer."""
+    """The distance ridden on the day of the last frame, by the odometer.
+
+    `ridden_km` is None before the odometer was seen, and while the date is unknown.
+    """
 
     def __init__(self, file: Path | None, vehicle: str) -> None:
+        self.ridden_km: float | None = None
         self._file, self._vehicle = file, vehicle
         self._date, self._begin = _read_day(file, vehicle) if file else ("", 0.0)  # odometer [m] when it began
         self._last: float | None = None  # m
         self._reported = SelfReported(ODOMETER)
         if self._begin:
             self._reported.accepted = self._begin, -inf
-        self._clock_set = False
-
-    @property
-    def ridden(self) -> float | None:
-        """Distance [km]; None before the odometer was seen, and while the date is unknown."""
-        return (self._last - self._begin) / 1e3 if self._last is not None and self._clock_set else None
 
     def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
-        """Take in the odometer [m] of a time [ns since 1970], which came at `now` [s]; False if it is implausible."""
+        """Take the odometer [m] of a time [ns since 1970], which came at `now` [s]; False if it is implausible."""
         if not self._reported.accepts(odometer, now):
             return False
         if self._reported.restarted:
             self._date, self._last = "", None
-        self._clock_set = stamp_ns >= CLOCK_SET_NS
-        if not self._clock_set:
-            self._last = self._last or odometer  # what is ridden until then counts for the day to be known
+        if stamp_ns < CLOCK_SET_NS:
+            self.ridden_km = None
+            self._last = self._last or odometer  # the distance until then counts for the day to be known
             return True
         date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
         if date != self._date or odometer - self._begin > LONGEST_DAY_M:
             self._date, self._begin = date, self._last or odometer
             if self._file:
                 self._write(self._file)
-        self._last = odometer
+        self._last, self.ridden_km = odometer, round((odometer - self._begin) / 1e3, 1)
         return True
 
     def _write(self, file: Path) -> None:

@@ -1,181 +1,277 @@
-"""Decode, check and age the range frames on the bus."""
+"""The view model: the range frames on the bus, checked and aged, as one picture for everything that shows them.
+
+A picture is a JSON object. Terminal, page, MQTT and Foxglove show nothing else; docs/dashboard.md describes its keys. A
+number that is stale, not available or never came is None. Units are in the names, as in the range frames.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import raw_range
-from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal
-from gz_onboard.dashboard import LATE_PERIODS
-from gz_onboard.events import NO_PACK, NO_SENSOR, OF_RIDING, STALE_PERIODS, Activity, Frame, Reason, State
+from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal, sensor_signal
+from gz_onboard.dashboard.vehicle_frames import LATE_PERIODS, UNKNOWN, VehicleFrames
+from gz_onboard.events import (
+    NO_PACK,
+    NO_SENSOR,
+    OF_RIDING,
+    ROLES,
+    STALE_PERIODS,
+    Activity,
+    Cause,
+    Frame,
+    Reason,
+    RouteState,
+    State,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
 
-    from gz_onboard.dashboard.vehicle_frames import VehicleFrames
+Picture = dict[str, Any]
 
+VERSION = 1  # of the keys of a picture
 TREND_STEP, TREND_STEPS = 10.0, 60  # s between the ranges of the last ten minutes, and their number
 PERIODS_MS = {"RANGE_Status": 100}  # where the DBC file does not say; 1000 for other messages
+NEARLY_EMPTY, NO_LONGER_EMPTY = 15.0, 17.0  # %: state of charge at which the alert begins, and ends
+CELL_HYSTERESIS = 2.0  # K: an alert about a cell ends this far within the limit
+NO_NEWS = "age_s", "counts", "vehicle_counts"
+"""Keys whose change alone is not shown at once."""
+ALERTS = (
+    "bus_down",
+    "silent",
+    "partly_silent",
+    "waiting",
+    "range_invalid",
+    "cell_too_hot",
+    "destination_unreachable",
+    "battery_nearly_empty",
+    "cell_too_cold",
+    "destination_uncertain",
+    "sensor_lost",
+)
+"""For the rider, the most urgent first."""
+_REASONS = [(int(reason), str(reason.name).lower(), reason_signal(reason)) for reason in Reason]
+_SENSORS = [(role, sensor_signal(role)) for role in ROLES]
 
 
-@dataclass
 class ReceivedMessage:
-    """One message of the range frames: definition, latest values and counts."""
+    """The last good frame of one message, and counts of its frames."""
 
-    definition: Message
-    period: float  # s
-    limits: dict[str, tuple[float, float]]  # raw
-    values: dict[str, float | None] = field(default_factory=dict)
-    time: float = -math.inf  # s, of the last good frame
-    counter: int | None = None
-    received: int = 0
-    lost: int = 0  # by its counter
-    bad: int = 0  # wrong length or checksum, or a counter that does not move
+    def __init__(self, definition: Message) -> None:
+        name, signals = definition.name, definition.signals
+        self.period = (definition.cycle_time or PERIODS_MS.get(name, 1000)) / 1000  # s
+        self.time = -math.inf  # s, of the last good frame
+        self.values: dict[str, float | None] = {}  # of the last good frame, in the units of the DBC file
+        self.received = self.lost = self.bad = 0  # lost: by the counter; bad: failed a check
+        self._definition = definition
+        self._limits = {s.name: raw_range(s, not_available=True) for s in signals}
+        self._scales = {s.name: (float(s.conversion.scale), float(s.conversion.offset)) for s in signals}
+        self._counter: int | None = None
+        self._counts = int(self._limits[f"{name}Counter"][1]) + 1
 
-    def late(self, now: float) -> bool:
-        """Whether a newer one should have come by `now` [s]."""
-        return now - self.time > LATE_PERIODS * self.period
+    def periods_old(self, now: float) -> float:
+        """The age of its values at `now` [s], in periods."""
+        return (now - self.time) / self.period
 
-    def stale(self, now: float) -> bool:
-        """Whether its values are too old to be shown at `now` [s]."""
-        return now - self.time > STALE_PERIODS * self.period
-
-    def take(self, data: bytes, now: float) -> bool:
-        """Take in a frame that came at `now`; False for one that fails a check, which is counted and not used."""
-        message = self.definition
+    def take(self, data: bytes, now: float) -> None:
+        """Take a frame that came at `now`; one that fails a check is counted and not used."""
+        message = self._definition
         if len(data) != message.length or crc8_sae_j1850(data[:-1]) != data[-1]:
             self.bad += 1
-            return False
-        raw = message.decode_simple(data, decode_choices=False, scaling=False)
-        counter = int(str(raw[f"{message.name}Counter"]))
-        if self.counter is not None and not self.stale(now):
-            step = (counter - self.counter) % (int(self.limits[f"{message.name}Counter"][1]) + 1)
+            return
+        raw: dict[str, Any] = message.decode_simple(data, decode_choices=False, scaling=False)
+        counter = int(raw[f"{message.name}Counter"])
+        if self._counter is not None and self.periods_old(now) <= STALE_PERIODS:
+            step = (counter - self._counter) % self._counts
             if step == 0:  # a repeated frame: the sender may hang
                 self.bad += 1
-                return False
+                return
             self.lost += step - 1
-        self.counter, self.time = counter, now
-        self.received += 1
-        for signal in message.signals:
-            value = float(str(raw[signal.name]))
-            low, high = self.limits[signal.name]
-            scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
-            self.values[signal.name] = value * scale + offset if low <= value <= high else None
-        return True
+        self._counter, self.time, self.received = counter, now, self.received + 1
+        for name, (low, high) in self._limits.items():
+            scale, offset = self._scales[name]
+            self.values[name] = round(raw[name] * scale + offset, 3) if low <= raw[name] <= high else None
 
 
 class View:
-    """The range frames of one vehicle, as last received.
+    """The range frames of one vehicle as last received, and what was seen since it began to listen.
 
-    source: the vehicle's publisher, or a DBC file, the package's ``range.dbc`` if none is given; vehicle: reads the
-    vehicle's own frames that are shown. No clock: times [s, monotonic] come with the frames. InputError if a
-    message or signal of ``range.dbc`` is missing in the file.
+    publisher: sends them, by default by ``range.dbc``; vehicle: reads the vehicle's own frames. No clock: times
+    [s, monotonic] come with the frames.
     """
 
-    def __init__(self, source: Publisher | Path | None = None, vehicle: VehicleFrames | None = None) -> None:
-        publisher = source if isinstance(source, Publisher) else Publisher(source)
-        self.source = publisher
-        self.file = publisher.file
-        self.vehicle = vehicle
-        self.messages: dict[str, ReceivedMessage] = {}
-        self._of_signal: dict[str, ReceivedMessage] = {}
-        for name, message in publisher.messages.items():
-            limits = {s.name: raw_range(s, not_available=True) for s in message.signals}
-            period = (message.cycle_time or PERIODS_MS.get(name, 1000)) / 1000
-            self.messages[name] = ReceivedMessage(message, period, limits)
-            self._of_signal |= dict.fromkeys(limits, self.messages[name])
+    def __init__(self, publisher: Publisher | None = None, vehicle: VehicleFrames | None = None) -> None:
+        publisher = publisher or Publisher()
+        self.file = publisher.file.name
+        self.comments = {s.name: s.comment or "" for m in publisher.messages.values() for s in m.signals}
+        self.messages = {name: ReceivedMessage(message) for name, message in publisher.messages.items()}
         self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent.items()}
-        self._seen_sensors = Reason(0)  # by their reasons, the sensors that have worked since the daemon started
+        self._vehicle = vehicle
+        others = vehicle.identifiers if vehicle else []
+        self.identifiers = None if others is None else [*self._by_identifier, *others]  # None: any may be of use
+        self._seen_sensors = 0  # by their reasons, the sensors that have worked since the daemon started
         self._ranges: dict[int, float | None] = {}  # km, by the number of the step of `TREND_STEP`
-
-    @property
-    def comments(self) -> dict[str, str]:
-        """Comments in the DBC file, by signal."""
-        return {s.name: s.comment or "" for entry in self.messages.values() for s in entry.definition.signals}
-
-    @property
-    def identifiers(self) -> list[int] | None:
-        """Of the frames that it reads, for the kernel's filter; None: any."""
-        others = self.vehicle.identifiers if self.vehicle else []
-        return None if others is None else [*self._by_identifier, *others]
+        self._alerts: list[str] = []  # of the last picture
 
     def take(self, frame: Frame, now: float) -> None:
-        """Take in a frame that came at `now`."""
-        entry = self._by_identifier.get(frame[1])
-        if entry is None:
-            if self.vehicle:
-                self.vehicle.take(frame, now)
-        elif entry.take(frame[2], now):
-            name = entry.definition.name
-            if name == "RANGE_Estimate":
-                step = int(now // TREND_STEP)
-                kept = {i: km for i, km in self._ranges.items() if i > step - TREND_STEPS}
-                self._ranges = kept | {step: entry.values["RANGE_Remaining"]}
-            elif name == "RANGE_Status":
-                self._note_sensors(now)
+        """Take a frame that came at `now`."""
+        if message := self._by_identifier.get(frame[1]):
+            message.take(frame[2], now)
+        elif self._vehicle:
+            self._vehicle.take(frame, now)
 
-    def _note_sensors(self, now: float) -> None:
-        """Note which sensors work: only one of these can be lost."""
-        working = ~self.reasons(now)
-        if self.activity(now) is Activity.CHARGING:
-            working &= ~OF_RIDING  # their absence is not reported then
-        starting = self._state("RANGE_StatusState", now) is State.STARTING
-        self._seen_sensors = working if starting else self._seen_sensors | working
+    def picture(self, now: float, channel: str, interface: str, bus_up: bool) -> Picture:
+        """Return the picture at `now`; channel, interface, bus_up: the bus that it is of, and whether that is up."""
+        old = {name: message.periods_old(now) for name, message in self.messages.items()}
+        stale = [name for name, periods in old.items() if periods > STALE_PERIODS]
+        fresh = [message.values for name, message in self.messages.items() if name not in stale]
+        values = {signal: value for found in fresh for signal, value in found.items()}
 
-    def value(self, signal: str, now: float) -> float | None:
-        """A signal's value in the units of the DBC file; None if it is stale, not available or never came.
+        def number(name: str) -> float | None:
+            return values.get(f"RANGE_{name}")
 
-        The consumption of the last kilometre is unknown while the state is invalid, as nobody knows its age.
-        """
-        if signal == "RANGE_ConsumptionRecent" and self.state(now) is State.INVALID:
-            return None
-        entry = self._of_signal[signal]
-        return None if entry.stale(now) else entry.values.get(signal)
+        state = self._state(values)
+        activity = None if state is State.STARTING else _member(Activity, number("Activity")) or None
+        reasons = sum(bit for bit, _, signal in _REASONS if values.get(signal))
+        if number("StatusState") == State.STARTING:
+            self._seen_sensors = 0
+        if "RANGE_Status" not in stale:
+            # Sensors of the ride are not reported while the vehicle is charged, and may be missing then.
+            self._seen_sensors |= ~(reasons | (int(OF_RIDING) if activity is Activity.CHARGING else 0))
+        lost, no_pack = int(reasons & NO_SENSOR & self._seen_sensors), int(reasons & NO_PACK)
+        # Without a pack it is switched off, unless a ride is under way or a pack that was there has gone.
+        off = activity is Activity.ASLEEP or (activity is None and not no_pack & self._seen_sensors)
+        waiting = bool(no_pack) and off and state in (State.STARTING, State.INVALID)
+        distrusted = [role for role, signal in _SENSORS if values.get(signal)]
+        charge = {
+            "power_w": number("ChargePower"),
+            "time_to_full_min": number("TimeToFull"),
+            "range_full_km": number("RemainingFull"),
+        }
+        route = {
+            "on_route": number("RouteState") == RouteState.ON,
+            "left_km": number("RouteLeft"),
+            "arrival_soc_percent": number("ArrivalStateOfCharge"),
+            "arrival_soc_p10_percent": number("ArrivalStateOfChargeP10"),
+            "battery_ends_after_km": number("BatteryEndsAfter"),
+        }
+        causes = [(_member(Cause, number(f"WhyCause{i}")), number(f"WhyDistance{i}")) for i in (1, 2)]
+        age = now - max(message.time for message in self.messages.values())
+        shown: Picture = {
+            "version": VERSION,
+            "channel": channel,
+            "interface": interface,
+            "file": self.file,
+            "bus_up": bus_up,
+            "heard": math.isfinite(age),
+            # The range's own state lives ten times as long as the status; once that is gone it says too much.
+            "state": None if state is None or "RANGE_Status" in stale else state.name.lower(),
+            "activity": None if activity is None else activity.name.lower(),
+            "range": {"km": number("Remaining"), "p10_km": number("RemainingP10"), "p90_km": number("RemainingP90")},
+            "range_10min_km": self._trend(number("Remaining"), now),
+            "battery": {
+                "soc_percent": number("StateOfCharge"),
+                "soc_sigma_percent": number("StateOfChargeSigma"),
+                "energy_left_wh": number("EnergyLeft"),
+            },
+            **(self._vehicle.values(now, distrusted) if self._vehicle else UNKNOWN),
+            "consumption": {
+                # Nobody knows how old the last kilometre is while there is no estimate.
+                "recent_wh_per_km": None if state is State.INVALID else number("ConsumptionRecent"),
+                "expected_wh_per_km": number("ConsumptionExpected"),
+            },
+            "charge": charge if any(value is not None for value in charge.values()) else None,
+            "route": route if number("RouteState") in (RouteState.ON, RouteState.OFF) else None,
+            "rated_km": number("WhyRated"),
+            "causes": [{"cause": cause.name.lower(), "km": km} for cause, km in causes if cause and km],
+            "reasons": [name for bit, name, _ in _REASONS if bit & reasons],
+            "lost": [name for bit, name, _ in _REASONS if bit & lost],
+            "distrusted": distrusted,
+            "late": [name for name, periods in old.items() if periods > LATE_PERIODS]
+            + (self._vehicle.late(now) if self._vehicle else []),
+            "stale": stale,
+            "age_s": round(age, 3) if math.isfinite(age) else None,
+            "counts": {
+                name: sum(getattr(message, name) for message in self.messages.values())
+                for name in ("received", "lost", "bad")
+            },
+            "vehicle_counts": {
+                name: number(f"Count{name.capitalize()}") for name in ("dropped", "implausible", "lost", "unknown")
+            },
+        }
+        shown["alerts"] = self._alerts = self._alerts_of(shown, waiting)
+        return shown
 
-    def state(self, now: float) -> State | None:
-        """State of the estimate; None if no frame says it.
+    def _state(self, values: Mapping[str, float | None]) -> State | None:
+        """The state of the estimate; None if no frame says it.
 
         The status comes ten times as often as the range, and may be ahead of it: until the range follows, the state is
         that of the last range, or starting.
         """
-        status, estimate = (self._state(name, now) for name in ("RANGE_StatusState", "RANGE_EstimateState"))
-        if status in KNOWN and self.value("RANGE_Remaining", now) is None:
-            if not self.messages["RANGE_Estimate"].received:
-                return State.STARTING
-            status = estimate
+        status: State | None = _member(State, values.get("RANGE_StatusState"))
+        estimate: State | None = _member(State, values.get("RANGE_EstimateState"))
+        if status in KNOWN and values.get("RANGE_Remaining") is None:
+            return estimate if self.messages["RANGE_Estimate"].received else State.STARTING
         return estimate if status is None else status
 
-    def _state(self, signal: str, now: float) -> State | None:
-        value = self.value(signal, now)
-        return State(int(value)) if value is not None and value in tuple(State) else None
-
-    def activity(self, now: float) -> Activity | None:
-        """Activity of the vehicle; None if it is unknown, or before there is an estimate."""
-        value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
-        return Activity(int(value)) if value and value in tuple(Activity) else None
-
-    def reasons(self, now: float) -> Reason:
-        """Reasons why the estimate is not as good as it could be."""
-        return Reason(sum(reason for reason in Reason if self.value(reason_signal(reason), now)))
-
-    def lost(self, now: float) -> Reason:
-        """Sensors that have worked and no longer do; one that never worked is missing, not lost."""
-        return self.reasons(now) & NO_SENSOR & self._seen_sensors
-
-    def waiting(self, now: float) -> bool:
-        """Whether there is no estimate because the scooter is not switched on yet, or sleeps."""
-        if self.state(now) not in (State.STARTING, State.INVALID):
-            return False
-        pack, activity = self.reasons(now) & NO_PACK, self.activity(now)
-        return bool(pack) and (activity is Activity.ASLEEP or (not activity and not pack & self._seen_sensors))
-
-    def trend(self, now: float) -> list[float | None]:
+    def _trend(self, km: float | None, now: float) -> list[float | None]:
         """Ranges [km], one each `TREND_STEP` of the last ten minutes, the oldest first; empty if there is none now."""
-        if self.value("RANGE_Remaining", now) is None:
-            return []
         step = int(now // TREND_STEP)
-        return [self._ranges.get(i) for i in range(step - TREND_STEPS + 1, step + 1)]
+        if step not in self._ranges:
+            self._ranges = {i: known for i, known in self._ranges.items() if i > step - TREND_STEPS}
+        self._ranges[step] = km
+        return [] if km is None else [self._ranges.get(i) for i in range(step - TREND_STEPS + 1, step + 1)]
+
+    def _alerts_of(self, shown: Picture, waiting: bool) -> list[str]:
+        """Those of `ALERTS` that hold."""
+        soc, route, cells, before = shown["battery"]["soc_percent"], shown["route"], shown["cells"], self._alerts
+        empty_at = NO_LONGER_EMPTY if "battery_nearly_empty" in before else NEARLY_EMPTY
+        silent = len(shown["stale"]) == len(self.messages)
+        too_hot = too_cold = unreachable = uncertain = False
+        if self._vehicle and cells:
+            charging = shown["activity"] == "charging"
+            low, high = self._vehicle.charging_limits if charging else self._vehicle.riding_limits
+            too_cold = cells["coldest_degc"] < low + CELL_HYSTERESIS * ("cell_too_cold" in before)
+            too_hot = cells["hottest_degc"] > high - CELL_HYSTERESIS * ("cell_too_hot" in before)
+        if route and route["on_route"]:
+            unreachable = route["battery_ends_after_km"] is not None or route["arrival_soc_percent"] == 0
+            uncertain = not unreachable and route["arrival_soc_p10_percent"] == 0
+        holds = {
+            "bus_down": not shown["bus_up"],
+            "silent": silent,
+            # Not for a message that never came: the first frames may have only just begun.
+            "partly_silent": not silent and any(self.messages[name].received for name in shown["stale"]),
+            "waiting": waiting,
+            "range_invalid": shown["state"] == "invalid" and not waiting,
+            "cell_too_hot": too_hot,
+            "destination_unreachable": unreachable,
+            "battery_nearly_empty": shown["activity"] != "charging" and soc is not None and soc <= empty_at,
+            "cell_too_cold": too_cold,
+            "destination_uncertain": uncertain,
+            "sensor_lost": "sensor_distrusted" in shown["reasons"] or (bool(shown["lost"]) and not waiting),
+        }
+        return [alert for alert in ALERTS if holds[alert]]
+
+
+def _member(kind: type[IntEnum], value: float | None) -> Any:
+    """The member with this value; None for a value that no member has."""
+    return kind(int(value)) if value is not None and value in tuple(kind) else None
+
+
+def encoded(values: Mapping[str, object]) -> bytes:
+    """Encode as one line of JSON."""
+    return json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
+
+
+def value_at(picture: Picture, path: str) -> Any:
+    """The value at `path`, such as ``route.left_km``; None if the part is not there."""
+    found: Any = picture
+    for key in path.split("."):
+        found = None if found is None else found[key]
+    return found

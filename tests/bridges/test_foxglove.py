@@ -20,11 +20,11 @@ from websockets.exceptions import InvalidStatus
 from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
 from gz_onboard.bridges.foxglove import LAYOUT
-from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.bus._can import can
+from gz_onboard.dashboard import live
+from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.location_rows import LOCATION_SCHEMA
-from gz_onboard.log_rows import ESTIMATE_UNITS, TEXTS, declare, estimate_row
+from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
@@ -63,8 +63,8 @@ def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Ite
         end = time.monotonic() + (duration or math.inf)
         yield lambda: stop.is_set() or time.monotonic() >= end
 
-    monkeypatch.setattr(command, "until_signalled", stopped)
-    monkeypatch.setattr(command, "_say", said.append)
+    monkeypatch.setattr(live, "until_signalled", stopped)
+    monkeypatch.setattr(command, "report", lambda _, text: said.append(text))
     arguments = ["foxglove", "--interface", "virtual", "--channel", channel, "--listen", "127.0.0.1:0"]
     thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
     thread.start()
@@ -162,10 +162,21 @@ def ridden() -> list[Frame]:
     return [first, *takewhile(lambda frame: frame[0] - first[0] < SECONDS * 10**9, frames)]
 
 
+def positions_of(frames: VehicleFrames, ridden: list[Frame]) -> dict[int, Any]:
+    """By their times, each as it came."""
+    found: dict[int, Any] = {}
+    for frame in ridden:
+        frames.take(frame, frame[0] * 1e-9)
+        if place := frames.values(frame[0] * 1e-9)["position"]:
+            found.setdefault(place["time_ns"], place)
+    return found
+
+
 def test_positions_are_those_of_the_log(ridden):
     logged = Kept()
     Pipeline(read_vehicle("reference"), log=logged).advance(ridden, ridden[-1][0])
-    rows = list(LivePositions(read_vehicle("reference")).take(ridden))
+    found = positions_of(VehicleFrames(read_vehicle("reference"), positions=True), ridden)
+    rows = [location_row(frame="gps", **one) for one in found.values()]
     once_a_second = logged.rows["/location"]
     assert len(once_a_second) >= SECONDS - 1
     at = {(row["timestamp"]["sec"], row["timestamp"]["nsec"]): row for row in rows}
@@ -181,26 +192,26 @@ def test_positions_are_those_of_the_log(ridden):
 @pytest.mark.parametrize(("fix", "told"), [(0, None), (1, None), (2, False), (3, True)])
 def test_what_a_fix_tells(ridden, fix, told):
     """Nothing of one that is none; no altitude of one in two dimensions."""
-    positions = LivePositions(read_vehicle("reference"))
-    for frame in ridden:
-        time_ns, identifier, data, channel = frame
-        if identifier == GPS_MOTION:
-            data = bytes([*data[:6], data[6] & 0b1001_1111 | fix << 5, *data[7:]])
-        list_of = list(positions.take([(time_ns, identifier, data, channel)]))
-        if time_ns - ridden[0][0] > 10**9:
-            assert [("altitude" in row) for row in list_of] in ([], [told]), list_of
+    changed = [
+        (t, i, bytes([*data[:6], data[6] & 0b1001_1111 | fix << 5, *data[7:]]) if i == GPS_MOTION else data, channel)
+        for t, i, data, channel in ridden
+    ]
+    found = positions_of(VehicleFrames(read_vehicle("reference"), positions=True), changed)
+    rows = [location_row(frame="gps", **one) for t, one in found.items() if t - ridden[0][0] > 10**9]
+    assert bool(rows) is (told is not None)
+    assert {"altitude" in row for row in rows} <= {told}
 
 
 def test_positions_of_a_truck_whoever_sends_them(tmp_path):
     """J1939: the source address is not in the DBC file, so the kernel cannot let through the position alone."""
     (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
     (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"\nlongitude = "Longitude"'))
-    positions = LivePositions(read_vehicle(tmp_path / "truck.toml"))
+    positions = VehicleFrames(read_vehicle(tmp_path / "truck.toml"), positions=True)
     assert positions.identifiers is None
     place = struct.pack("<II", round((48.1 + 210) * 1e7), round((11.6 + 210) * 1e7))
     frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
-    (row,) = positions.take(frames)
-    assert (row["latitude"], row["longitude"]) == (48.1, 11.6)
+    (row,) = positions_of(positions, frames).values()
+    assert (row["latitude"], row["longitude"]) == pytest.approx((48.1, 11.6))
 
 
 def test_the_layout_is_written_where_it_is_wanted(tmp_path, capsys):
@@ -221,9 +232,10 @@ def test_a_vehicle_without_positions(tmp_path, capsys):
 @pytest.mark.parametrize("client", CLIENTS)
 def test_positions_live(client, monkeypatch, ridden):
     vehicle = read_vehicle("reference")
-    identifiers = LivePositions(vehicle).identifiers or []
+    identifiers = VehicleFrames(vehicle, positions=True).identifiers or []
     mine = [frame for frame in ridden if frame[1] in identifiers]
-    recorded = {(row["latitude"], row["longitude"]) for row in LivePositions(vehicle).take(ridden)}
+    rows = positions_of(VehicleFrames(vehicle, positions=True), ridden).values()
+    recorded = {(round(row["latitude"], 7), round(row["longitude"], 7)) for row in rows}
     began = time.time()
     with (
         serving("f3", monkeypatch, "--vehicle", "reference") as address,
@@ -233,9 +245,8 @@ def test_positions_live(client, monkeypatch, ridden):
         assert channels["/location"]["schemaName"] == "foxglove.LocationFix"
         assert json.loads(channels["/location"]["schema"]) == LOCATION_SCHEMA
         assert next(heard).topic == "/estimate"  # comes each second; so what was asked for before is subscribed to, too
-        send(bus, mine[:4])
-        for start in range(4, 40, 4):
-            send(bus, mine[start : start + 4])
+        for start in range(0, 400, 100):
+            send(bus, mine[start : start + 100])
             _, time_ns, row = next(one for one in heard if one.topic == "/location")
             assert (row["latitude"], row["longitude"]) in recorded
             assert began <= row["timestamp"]["sec"] + 1

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.events import Frame
-from gz_onboard.location_rows import LOCATION_SCHEMA, location_row
+from gz_onboard.log_rows import LOCATION_SCHEMA, location_row
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.vehicle import read_vehicle

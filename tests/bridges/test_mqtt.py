@@ -21,10 +21,9 @@ import jinja2
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.bridges import home_assistant
-from gz_onboard.bridges import mqtt as bridge_command
-from gz_onboard.bridges.broker import PASSWORD, USER, Address
-from gz_onboard.dashboard.picture import picture
+from gz_onboard.bridges import mqtt
+from gz_onboard.bridges.broker import PASSWORD, USER, Broker, read_login
+from gz_onboard.dashboard import live
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import InputError
 from gz_onboard.events import Activity, State
@@ -33,7 +32,7 @@ from tests.dashboard.served import PACK, Sender, cells, odometer
 from tests.dashboard.test_terminal import ESTIMATE
 
 STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
-NUMBERS = [key for key, sensor in home_assistant.SENSORS.items() if sensor.unit]
+NUMBERS = [key for key, (_, about) in mqtt.SENSORS.items() if "unit_of_measurement" in about]
 
 
 @contextmanager
@@ -47,8 +46,8 @@ def bridge(port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPat
         end = time.monotonic() + (duration or math.inf)
         yield lambda: stop.is_set() or time.monotonic() >= end
 
-    monkeypatch.setattr(bridge_command, "until_signalled", stopped)
-    monkeypatch.setattr(bridge_command, "_say", said.append)
+    monkeypatch.setattr(live, "until_signalled", stopped)
+    monkeypatch.setattr(mqtt, "report", lambda _, text: said.append(text))
     arguments = ["mqtt", f"127.0.0.1:{port}", "--interface", "virtual", "--channel", channel, "--name", "scooter"]
     thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
     thread.start()
@@ -71,9 +70,9 @@ def shown(about: dict[str, Any], state: dict[str, Any]) -> dict[str, str]:
     for key, sensor in about["components"].items():
         (availability,) = sensor["availability"]
         there = jinja2.Template(availability["value_template"]).render(value_json=state)
-        assert there in (availability["payload_available"], availability["payload_not_available"])
+        assert there in ("online", "offline")  # what Home Assistant expects, unless it is told others
         assert availability["topic"] == about["state_topic"]
-        if there == availability["payload_available"]:
+        if there == "online":
             rendered[key] = jinja2.Template(sensor["value_template"]).render(value_json=state)
     return rendered
 
@@ -169,8 +168,8 @@ def test_a_broker_that_is_not_there_and_goes_away(tmp_path, monkeypatch):
 
 def test_the_state_does_not_outlive_who_says_it(tmp_path, monkeypatch):
     """A last will is lost with a broker that loses power; what it kept until then must end by itself."""
-    monkeypatch.setattr(home_assistant, "EXPIRES_S", 2)
-    monkeypatch.setattr(bridge_command, "AT_LEAST_S", 1000.0)
+    monkeypatch.setattr(mqtt, "EXPIRES_S", 2)
+    monkeypatch.setattr(mqtt, "AT_LEAST_S", 1000.0)
     port = free_port()
     with broker(tmp_path, port), bridge(port, "m3", monkeypatch=monkeypatch):
         with listening(port) as listener:
@@ -232,8 +231,8 @@ def test_units_and_classes_go_together():
     """As Home Assistant's documentation has them; a pair that it does not know makes it drop the sensor."""
     known = {"distance": "km", "battery": "%", "energy_storage": "Wh", "energy_distance": "Wh/km", "power": "W"}
     known |= {"duration": "min", "temperature": "°C"}
-    about: Any = home_assistant.discovery("scooter")
-    assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(home_assistant.SENSORS)
+    about: Any = mqtt.discovery("scooter")
+    assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(mqtt.SENSORS)
     for key, sensor in about["components"].items():
         assert re.fullmatch("[a-z0-9_]+", key)
         assert not hasattr(dict, key), "a template would find the method"
@@ -247,26 +246,34 @@ def test_units_and_classes_go_together():
 
 
 def test_each_value_of_a_picture_has_a_sensor():
-    state = home_assistant.state_of(picture(View(), 0.0, ("a", "virtual"), True), home_assistant.ONLINE)
-    assert state.keys() - {"status"} == home_assistant.SENSORS.keys()
-    long = home_assistant._joined(["no_imu"] * 100)
+    picture = View().picture(0.0, "a", "virtual", True)
+    assert mqtt.state_of(picture).keys() - {"status"} == mqtt.SENSORS.keys()
+    long = mqtt.state_of(picture | {"state": "degraded", "reasons": ["no_imu"] * 100})["reasons"]
     assert len(long) <= 255
     assert set(long.split(", ")) == {"no_imu"}
+
+
+def broker_at(text: str, tls: str | None = None) -> Broker:
+    return Broker(text, "scooter", ("topic", b""), print, tls=tls)
 
 
 @pytest.mark.parametrize("text", ["", "broker:", "broker:0", "broker:99999", "mqtt://broker", "a b", "::1"])
 def test_what_is_no_address(text):
     with pytest.raises(InputError, match="must be HOST"):
-        Address.of(text, environ={})
+        broker_at(text)
 
 
 def test_addresses():
-    assert str(Address.of("broker.local", environ={})) == "broker.local:1883"
-    assert str(Address.of("broker", "", environ={})) == "broker:8883"
-    assert str(Address.of("[::1]:1884", environ={})) == "[::1]:1884"
+    assert str(broker_at("broker.local")) == "the broker broker.local:1883"
+    assert str(broker_at("broker", "")) == "the broker broker:8883"
+    assert str(broker_at("[::1]:1884")) == "the broker [::1]:1884"
+
+
+def test_a_login_from_the_environment():
+    assert read_login(None, {}) == (None, None)
+    assert read_login(None, {USER: "a", PASSWORD: "secret"}) == ("a", "secret")
     with pytest.raises(InputError, match="is set"):
-        Address.of("broker", environ={PASSWORD: "x"})
-    assert "secret" not in repr(Address.of("broker", environ={USER: "a", PASSWORD: "secret"}))
+        read_login(None, {PASSWORD: "x"})
 
 
 def test_a_login_that_others_can_read(tmp_path: Path):
@@ -274,14 +281,13 @@ def test_a_login_that_others_can_read(tmp_path: Path):
     file.write_text('user = "a"\npassword = "b"\n')
     file.chmod(0o640)
     with pytest.raises(InputError, match="chmod 600"):
-        Address.of("broker", None, file, {})
+        read_login(file)
 
 
 def test_an_empty_login_is_none(tmp_path: Path):
     file = tmp_path / "login.toml"
     file.touch(0o600)
-    address = Address.of("broker", None, file, {})
-    assert (address.user, address.password) == (None, None)
+    assert read_login(file) == (None, None)
     file.write_text('user = "a"\n')
     with pytest.raises(InputError, match="password: is missing"):
-        Address.of("broker", None, file, {})
+        read_login(file)

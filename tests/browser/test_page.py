@@ -184,7 +184,7 @@ def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
             page.goto(address)
             shows(page, range_value="34")
             page.evaluate("window.same = true")
-        monkeypatch.setattr("gz_onboard.dashboard.server.build_of", lambda files: "another")
+        monkeypatch.setattr("gz_onboard.dashboard.server.__version__", "another")
         with ExitStack() as stack:
             with page.expect_event("load"):
                 stack.enter_context(dashboard("new", urlsplit(address).netloc))

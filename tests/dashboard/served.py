@@ -14,10 +14,10 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.pictures import clock, pictures
+from gz_onboard.dashboard.live import clock, pictures
 from gz_onboard.dashboard.server import Feed, served
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
-from gz_onboard.dashboard.view import TREND_STEP, View
+from gz_onboard.dashboard.view import TREND_STEP, View, encoded
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, send
@@ -36,12 +36,13 @@ def dashboard(
         past = replace(ESTIMATE, range=metres, range_p10=0.9 * metres, range_p90=1.1 * metres)
         for frame in publisher.range(past, COUNTS, 0):
             view.take(frame, start + TREND_STEP * i)
+        view.picture(start + TREND_STEP * i, channel, "virtual", True)
     bus = CanChannel("virtual", channel, identifiers=view.identifiers)
     bus.open()
 
     def publish() -> None:
         for new in pictures(view, bus, stop.is_set):
-            feed.publish(new.encoded())
+            feed.publish(encoded(new))
 
     with served(feed, listen) as address:
         loop = threading.Thread(target=publish)

@@ -13,17 +13,16 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.command import view_of
-from gz_onboard.dashboard.picture import Picture, picture
+from gz_onboard.dashboard.live import view_of
 from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell_limits
-from gz_onboard.dashboard.view import View
+from gz_onboard.dashboard.view import Picture, View
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import Activity, Estimate
 from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.served import PACK, Own, cells, odometer, own_frame
-from tests.dashboard.test_picture import HEALTHY, SOURCE
+from tests.dashboard.test_picture import BUS, HEALTHY
 from tests.dashboard.test_terminal import second
 from tests.support import ROOT
 
@@ -32,15 +31,15 @@ DAY = 86_400 * 10**9
 NOON = 1_750_000_000 * 10**9 // DAY * DAY + DAY // 2
 
 
-def of(estimate: Estimate, *own: Own, before: tuple[str, ...] = (), after: float = 0.0) -> Picture:
+def of(estimate: Estimate, *own: Own, after: float = 0.0) -> Picture:
     view = View(vehicle=VehicleFrames(REFERENCE))
     for frame in [*second(Publisher(), estimate), *(own_frame(*one) for one in (PACK, *own))]:
         view.take(frame, 100.0)
-    return picture(view, 100.0 + after, SOURCE, True, before)
+    return view.picture(100.0 + after, *BUS)
 
 
 def test_cells_and_distance_are_those_of_the_frames():
-    got = json.loads(of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1001.4)).encoded())
+    got = of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1001.4))
     assert got["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
     assert (got["odometer_km"], got["ridden_today_km"]) == (1001.4, 1.4)
     assert got["alerts"] == []
@@ -48,8 +47,8 @@ def test_cells_and_distance_are_those_of_the_frames():
 
 def test_without_them_there_is_nothing():
     got = of(HEALTHY)
-    assert (got.cells, got.odometer_km, got.ridden_today_km) == (None, None, None)
-    assert got.late == ()
+    assert (got["cells"], got["odometer_km"], got["ridden_today_km"]) == (None, None, None)
+    assert got["late"] == []
 
 
 def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
@@ -58,11 +57,11 @@ def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
     wrong = (0, own_frame(*PACK)[1], bytes(8), 0)
     for frame in own_frame(*cells(21, 24, 155)), own_frame(*odometer(1000.0)), wrong, own_frame(*cells(21, 24, 155)):
         frames.take(frame, 1.0)
-    assert frames.cells(1.0) is None
-    assert frames.odometer(1.0) == (None, None)
+    assert frames.values(1.0)["cells"] is None
+    assert frames.values(1.0)["odometer_km"] is None
     for own in PACK, cells(21, 24, 27):
         frames.take(own_frame(*own), 1.0)
-    assert frames.cells(1.0) == (21.0, 27.0)
+    assert frames.values(1.0)["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
 
 
 def test_a_checksum_that_is_right_by_chance_makes_no_vehicle():
@@ -71,40 +70,45 @@ def test_a_checksum_that_is_right_by_chance_makes_no_vehicle():
     for i in range(2000):
         frames.take((NOON + i, own_frame(*PACK)[1], chance.randbytes(8), 0), 1.0)
     frames.take(own_frame(*cells(21, 24, 155), NOON + 2000), 1.0)
-    assert frames.cells(1.0) is None
+    assert frames.values(1.0)["cells"] is None
 
 
 @pytest.mark.parametrize(("after", "late", "there"), [(2.9, False, True), (3.1, True, True), (10.1, False, False)])
 def test_an_old_value_is_said_to_be_late_and_then_is_gone(after, late, there):
     got = of(HEALTHY, odometer(1000.0), cells(21, 24, 55), after=after)
-    assert ("cell_temperature" in got.late) == ("odometer" in got.late) == late
-    assert (got.cells is not None) == (got.ridden_today_km is not None) == there
-    assert ("cell_too_hot" in got.alerts) == there
+    assert ("cell_temperature" in got["late"]) == ("odometer" in got["late"]) == late
+    assert (got["cells"] is not None) == (got["ridden_today_km"] is not None) == there
+    assert ("cell_too_hot" in got["alerts"]) == there
 
 
 def test_a_sensor_that_the_estimator_does_not_trust_is_not_shown():
     distrusted = replace(HEALTHY, distrusted=("cell_temperature", "odometer"))
     got = of(distrusted, odometer(1000.0), cells(21, 24, 55))
-    assert (got.cells, got.odometer_km, got.ridden_today_km) == (None, None, None)
-    assert "cell_too_hot" not in got.alerts
+    assert (got["cells"], got["odometer_km"], got["ridden_today_km"]) == (None, None, None)
+    assert "cell_too_hot" not in got["alerts"]
 
 
 @pytest.mark.parametrize(
     ("activity", "own", "before", "alerts"),
     [  # the controller of the reference scooter gives its full current from -5 to 50 degC
-        (Activity.RIDING, cells(-5, 0, 50), (), ()),
-        (Activity.RIDING, cells(20, 30, 51), (), ("cell_too_hot",)),
-        (Activity.RIDING, cells(-6, 0, 2), (), ("cell_too_cold",)),
-        (Activity.RIDING, cells(20, 30, 49), ("cell_too_hot",), ("cell_too_hot",)),
-        (Activity.RIDING, cells(20, 30, 47), ("cell_too_hot",), ()),
-        (Activity.RIDING, cells(-4, 0, 2), ("cell_too_cold",), ("cell_too_cold",)),
-        (Activity.CHARGING, cells(0, 20, 45), (), ()),
-        (Activity.CHARGING, cells(-1, 0, 2), (), ("cell_too_cold",)),
-        (Activity.CHARGING, cells(20, 30, 46), (), ("cell_too_hot",)),
+        (Activity.RIDING, cells(-5, 0, 50), None, ()),
+        (Activity.RIDING, cells(20, 30, 51), None, ("cell_too_hot",)),
+        (Activity.RIDING, cells(-6, 0, 2), None, ("cell_too_cold",)),
+        (Activity.RIDING, cells(20, 30, 49), cells(20, 30, 51), ("cell_too_hot",)),
+        (Activity.RIDING, cells(20, 30, 47), cells(20, 30, 51), ()),
+        (Activity.RIDING, cells(-4, 0, 2), cells(-6, 0, 2), ("cell_too_cold",)),
+        (Activity.CHARGING, cells(0, 20, 45), None, ()),
+        (Activity.CHARGING, cells(-1, 0, 2), None, ("cell_too_cold",)),
+        (Activity.CHARGING, cells(20, 30, 46), None, ("cell_too_hot",)),
     ],
 )
 def test_a_cell_that_is_too_hot_or_too_cold_is_an_alert(activity, own, before, alerts):
-    assert of(replace(HEALTHY, activity=activity), own, before=before).alerts == alerts
+    view = View(vehicle=VehicleFrames(REFERENCE))
+    for now, one in enumerate((before, own) if before else (own,)):
+        for frame in [*second(Publisher(), replace(HEALTHY, activity=activity)), own_frame(*PACK), own_frame(*one)]:
+            view.take(frame, 100.0 + now)
+        got = view.picture(100.0 + now, *BUS)
+    assert got["alerts"] == list(alerts)
 
 
 def test_limits_are_those_of_the_controller():
@@ -127,7 +131,8 @@ def ridden(kept: Path | None, *seen: tuple[float, int], lasts: float = TIMING.ac
         for i in range(CONFIRM + 1):  # of a leap in time
             frames.take(own_frame(*odometer(km), stamp + i), now + i / CONFIRM * lasts)
         now += lasts
-    return frames.odometer(now)[1]
+    found: float | None = frames.values(now)["ridden_today_km"]
+    return found
 
 
 def test_a_day_begins_at_midnight_and_goes_on_over_a_restart(tmp_path):
@@ -192,7 +197,7 @@ def test_an_odometer_that_leaps_is_not_shown(wrong):
     for i, km in enumerate([0.0] * 3 + [1000.0] * 3 + [wrong] * 60 + [1000.1]):
         for one in PACK, odometer(km):
             frames.take(own_frame(*one, NOON + i * 10**9), float(i))
-        shown.append(frames.odometer(float(i))[0])
+        shown.append(frames.values(float(i))["odometer_km"])
     assert shown[:3] == [None] * 3
     assert {km for km in shown[3:] if km is not None} == {1000.0, 1000.1}
     assert shown[-2:] == [None, 1000.1]
@@ -248,7 +253,7 @@ def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, own_
     assert {frame[1] for frame in frames} <= set(view.identifiers or [])
     for frame in frames:
         view.take(frame, 100.0)
-    assert view.value("RANGE_Remaining", 100.0) == 34.21
+    assert view.picture(100.0, *BUS)["range"]["km"] == 34.21
 
 
 def test_only_the_page_keeps_a_day(capsys):

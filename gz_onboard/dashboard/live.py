@@ -1,0 +1,131 @@
+"""The loop that reads the bus and makes pictures of it, the same for terminal, page, MQTT and Foxglove."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from gz_onboard import notify
+from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.dbc import find_dbc
+from gz_onboard.bus.publisher import Publisher
+from gz_onboard.dashboard.vehicle_frames import VehicleFrames
+from gz_onboard.dashboard.view import NO_NEWS, Picture, View
+from gz_onboard.errors import InputError, not_an_input
+from gz_onboard.options import add_shared, number
+from gz_onboard.vehicle import read_vehicle
+
+DURATION_S = 1e-3, 1e9
+POLL_S = 0.05
+AGE_S = 0.2  # between two looks for values that have become stale, while no frame comes
+AT_LEAST_S = 1.0  # between two pictures though nothing has changed; without one the loop hangs
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """Add the options of every command that shows range frames: which bus, which vehicle, how long."""
+    add_shared(parser, "--interface", "--channel")
+    dbc = "DBC file of the range frames (default: the vehicle's, range.dbc for the reference scooter)"
+    parser.add_argument("--dbc", metavar="FILE", help=dbc)
+    vehicle = "the vehicle, as for run (default: reference; with --dbc alone only the range frames are read)"
+    add_shared(parser, "--vehicle", default=None, help=vehicle)
+    duration = number("--duration", *DURATION_S, "s")
+    parser.add_argument("--duration", type=duration, metavar="S", help="end after this time")
+
+
+def view_of(
+    arguments: argparse.Namespace, *, own_frames: bool = False, positions: bool = False, day: Path | None = None
+) -> View:
+    """Return the view of the range frames that the options ask for.
+
+    own_frames: also of the vehicle's own; positions: also of those that say where it is; day: file that keeps where the
+    day began.
+    """
+    dbc = find_dbc(arguments.dbc, Path.cwd()) if arguments.dbc else None
+    if not arguments.vehicle and (dbc or not own_frames):
+        if day:
+            raise InputError(f"--day {day}: with --dbc alone no odometer is read; give --vehicle, too")
+        return View(Publisher(dbc))
+    vehicle = read_vehicle(arguments.vehicle or "reference")
+    publisher = Publisher(dbc) if dbc else vehicle.publisher()
+    if not (own_frames or positions) or not vehicle.mapping.reads_frames:
+        return View(publisher)
+    not_an_input([day], [vehicle.file])
+    return View(publisher, VehicleFrames(vehicle, day, positions=positions))
+
+
+@contextmanager
+def live(view: View, arguments: argparse.Namespace) -> Iterator[Iterator[Picture]]:
+    """Open the bus of the options and yield the pictures of `view`, until the duration is over or a signal comes."""
+    channel = CanChannel(arguments.interface, arguments.channel, identifiers=view.identifiers)
+    channel.open()
+    with closing(channel), until_signalled(arguments.duration) as stopped:
+        yield pictures(view, channel, stopped)
+
+
+def pictures(view: View, channel: CanChannel, stopped: Callable[[], bool]) -> Iterator[Picture]:
+    """Drain the channel into the view until it is time to stop: a picture when it has changed, and each second."""
+    shown: Picture = {}
+    looked = given = fed = -math.inf
+    interval = notify.watchdog_interval() or math.inf
+    while not stopped():
+        frames = channel.drain()
+        now = clock()
+        for frame in frames:
+            view.take(frame, now)
+        if frames or now - looked >= AGE_S:
+            looked = now
+            picture = view.picture(now, channel.name, channel.interface, channel.up)
+            news = {key: value for key, value in picture.items() if key not in NO_NEWS}
+            if news != shown or now - given >= AT_LEAST_S:
+                shown, given = news, now
+                yield picture
+        if now - fed >= interval:
+            notify.alive()
+            fed = now
+        time.sleep(POLL_S)
+    notify.stopping()
+
+
+def clock() -> float:
+    """Time since boot [s], suspended or not: numbers from before the board slept are old."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+@contextmanager
+def until_signalled(duration: float | None = None) -> Iterator[Callable[[], bool]]:
+    """Yield a function that says whether to stop: after `duration` [s], or at SIGINT, SIGTERM or SIGHUP."""
+    end = time.monotonic() + (duration or math.inf)
+    stopping = threading.Event()
+    in_front = threading.current_thread() is threading.main_thread()  # only there can signals be handled
+    wanted = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if in_front else ()
+    before = {number: signal.signal(number, lambda *_: stopping.set()) for number in wanted}
+    try:
+        yield lambda: stopping.is_set() or time.monotonic() >= end
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def report(command: str, text: str) -> None:
+    """Say `text` on standard output, where there is one, and to systemd."""
+    if sys.stdout is not None:
+        print(f"{command}: {text}", flush=True)
+    notify.ready(text)
+
+
+def host_and_port(text: str, port: int | None = None) -> tuple[str, int]:
+    """Split ``HOST:PORT`` or ``[::1]:PORT``; with a default `port` also a host alone. InputError for anything else."""
+    found = re.fullmatch(r"(\[[\w:.%]+\]|[^:\s/@]+)(?::(\d{1,5}))?", text, re.ASCII)
+    number = int(found[2] or port or 0) if found and (found[2] or port) else -1
+    if not found or not (0 if port is None else 1) <= number < 1 << 16:
+        form = "ADDRESS:PORT" if port is None else "HOST or HOST:PORT"
+        raise InputError(f"{text}: must be {form}, such as 127.0.0.1:8000 or [::1]:8000")
+    return found[1].strip("[]"), number
