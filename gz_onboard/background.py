@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
+from queue import Queue
 from typing import Any
 
 log = logging.getLogger("gz-onboard")
@@ -21,33 +21,29 @@ class Background:
 
     def __init__(self, name: str, limit: int = 1) -> None:
         self._limit = limit
-        self._calls: deque[tuple[Callable[..., object], tuple[Any, ...], int]] = deque()
+        self._calls: Queue[tuple[Callable[..., object], tuple[Any, ...], int] | None] = Queue()
         self._weight = 0
-        self._changed = threading.Condition()
-        self._closing = False
+        self._lock = threading.Lock()  # of the weight
         self._began: float | None = None
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._started = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)  # started by the first call
 
     def call(self, function: Callable[..., object], *arguments: Any, weight: int = 1) -> bool:
-        """Have `function` called with the arguments, soon; False if too much waits and it will not be.
+        """Have `function` called with the arguments, soon; False if too much waits already and it will not be.
 
-        What weighs nothing is always taken, and while nothing waits, any weight.
+        A call without weight is always taken, and while nothing waits, one of any weight.
         """
-        with self._changed:
-            if self._closing or (weight and self._weight and self._weight + weight > self._limit):
+        with self._lock:
+            if weight and self._weight and self._weight + weight > self._limit:
                 return False
             self._weight += weight
-            self._calls.append((function, arguments, weight))
-            self._changed.notify_all()
-            if not self._started:
-                self._started = True
-                self._thread.start()
+        self._calls.put((function, arguments, weight))
+        if self._thread.ident is None:
+            self._thread.start()
         return True
 
     @property
     def load(self) -> float:
-        """How much of the limit is taken; 0 when all is done."""
+        """Share of the limit that is taken; 0 when all is done."""
         return self._weight / self._limit
 
     @property
@@ -57,33 +53,26 @@ class Background:
         return 0.0 if began is None else time.monotonic() - began
 
     def wait(self, seconds: float) -> bool:
-        """Until all calls asked for are done; False if they are not within `seconds`."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._calls, seconds)
+        """Wait until all calls are done; False if they are not within `seconds`."""
+        with self._calls.all_tasks_done:
+            return self._calls.all_tasks_done.wait_for(lambda: not self._calls.unfinished_tasks, seconds)
 
     def close(self, seconds: float) -> bool:
-        """Take no more calls, and wait until the rest is done; False if it is not within `seconds`."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-        if self._started:
+        """Wait until all calls are done, and end the thread; False if they are not within `seconds`."""
+        self._calls.put(None)
+        if self._thread.ident is not None:
             self._thread.join(seconds)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._calls or self._closing)
-                if not self._calls:
-                    return
-                function, arguments, weight = self._calls[0]
+        while waiting := self._calls.get():
+            function, arguments, weight = waiting
             self._began = time.monotonic()
             try:
                 function(*arguments)
             except Exception:
                 log.exception("in the background")
             self._began = None
-            with self._changed:
-                self._calls.popleft()
+            with self._lock:
                 self._weight -= weight
-                self._changed.notify_all()
+            self._calls.task_done()

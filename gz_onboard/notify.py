@@ -1,67 +1,35 @@
-"""Reports to systemd: ready, alive, status, stopping (sd_notify(3), sd_watchdog_enabled(3)).
-
-Nothing happens where systemd does not listen: every function works the same in a terminal and in a test.
-"""
+"""Reports to systemd (sd_notify(3), sd_watchdog_enabled(3)); without systemd they do nothing."""
 
 from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Mapping
 
 
-def notify(message: str, environ: Mapping[str, str] = os.environ) -> bool:
-    """Send `message`, one ``KEY=value`` a line, to systemd; False if nobody listens or it cannot be sent.
+def notify(**fields: object) -> bool:
+    """Send fields such as ``READY=1``, ``WATCHDOG=1`` or ``STATUS=text`` to systemd; False if nobody takes them.
 
-    Never blocks and never raises: neither a full nor a vanished socket may stop the estimate. A watchdog
-    message that is lost this way is made up for by the next.
+    Never blocks and never raises: neither a full nor a vanished socket may stop the estimate. The next watchdog message
+    makes up for one that is lost.
     """
-    address = environ.get("NOTIFY_SOCKET", "")
+    address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return False
-    if address.startswith("@"):  # Linux' abstract namespace
-        address = "\0" + address[1:]
+    # A line break within a value would begin another field.
+    message = "\n".join(f"{name}={' '.join(str(value).split())}" for name, value in fields.items())
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as s:
-            s.sendto(message.encode(errors="replace"), address)
+            abstract = address.startswith("@")  # Linux' namespace of sockets without files
+            s.sendto(message.encode(errors="replace"), f"\0{address[1:]}" if abstract else address)
     except OSError:
         return False
     return True
 
 
-def ready(status: str = "", environ: Mapping[str, str] = os.environ) -> bool:
-    """Say that start-up is complete, with a `status` for ``systemctl status``."""
-    return notify(f"READY=1\n{_field(status)}" if status else "READY=1", environ)
+def watchdog_interval() -> float | None:
+    """Seconds between two ``WATCHDOG=1``: half of the unit's WatchdogSec=; None without a watchdog.
 
-
-def alive(environ: Mapping[str, str] = os.environ) -> bool:
-    """Feed the watchdog."""
-    return notify("WATCHDOG=1", environ)
-
-
-def status(text: str, environ: Mapping[str, str] = os.environ) -> bool:
-    """Set the line that ``systemctl status`` shows."""
-    return notify(_field(text), environ)
-
-
-def stopping(text: str = "", environ: Mapping[str, str] = os.environ) -> bool:
-    """Say that the shutdown has begun."""
-    return notify(f"STOPPING=1\n{_field(text)}" if text else "STOPPING=1", environ)
-
-
-def watchdog_interval(environ: Mapping[str, str] = os.environ) -> float | None:
-    """Seconds between two calls of `alive`: half of the unit's WatchdogSec=; None without a watchdog.
-
-    A WATCHDOG_PID that is not ours means that the variables were meant for another process.
+    With a WATCHDOG_PID that is not ours, the variables are meant for another process.
     """
-    try:
-        timeout_us = int(environ["WATCHDOG_USEC"])
-        pid = int(environ.get("WATCHDOG_PID", os.getpid()))
-    except (KeyError, ValueError):
-        return None
-    return timeout_us / 2e6 if timeout_us > 0 and pid == os.getpid() else None
-
-
-def _field(status: str) -> str:
-    """The status as a field of a message; a line break in it would begin another field."""
-    return "STATUS=" + " ".join(status.split())
+    timeout_us, pid = os.environ.get("WATCHDOG_USEC", "0"), os.environ.get("WATCHDOG_PID", str(os.getpid()))
+    return int(timeout_us) / 2e6 if timeout_us.isdecimal() and int(timeout_us) and pid == str(os.getpid()) else None

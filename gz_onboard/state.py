@@ -1,7 +1,6 @@
 """The file of the saved state: JSON with a checksum, replaced atomically, and one previous copy.
 
-``NAME.json`` is the state, ``NAME.previous.json`` the one saved before it. A copy that cannot be used is renamed to end
-in ``.refused``, so that it can be examined and the next start does not meet it again.
+``NAME.json`` is the state, ``NAME.previous.json`` the one saved before it.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _HEAD = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 def encode(snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> bytes:
     """Encode a snapshot taken at `time` [s since the epoch], `uptime` [s] after the system started.
 
-    ValueError or TypeError if the snapshot holds what JSON has no word for: not-a-number, infinities, objects.
+    ValueError or TypeError if the snapshot holds something that JSON cannot: not-a-number, infinities, objects.
     """
     document = {"saved_at": time, "uptime": uptime, "estimator": snapshot}
     body = json.dumps(document, allow_nan=False).encode("ascii")[1:]
@@ -40,26 +39,23 @@ def decode(
     """Decode a file to (snapshot, its age [s] at `time` and `uptime`; None where no clock can be believed).
 
     kept: time of a clock that runs while the power is off (`kept_time`) [s since the epoch]; inf: `time` is of such a
-    clock. ValueError unless the file is exactly as it was written.
+    clock. ValueError unless the file is exactly as `encode` made it.
     """
     head = _HEAD.match(text)
     if not head:
         raise ValueError("is not a saved state" if text else "is empty")
     body = text[head.end() :]
-    if not body.endswith(b"}\n") or zlib.crc32(body[:-1]) != int(head[1], 16):
+    if zlib.crc32(body[:-1]) != int(head[1], 16) or not body.endswith(b"}\n"):
         raise ValueError("is damaged: its checksum is wrong")
-    try:
-        document = json.loads(b"{" + body)
-        snapshot, saved_at, saved_uptime = document["estimator"], float(document["saved_at"]), document["uptime"]
-    except (ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:  # not written by `encode`
-        raise ValueError("is not a saved state, although its checksum is right") from error
+    document = json.loads(b"{" + body)
+    saved_at, saved_uptime = document["saved_at"], document["uptime"]
     age = time - saved_at if CLOCK_SET_S < saved_at <= time else None
     # A board without a clock of its own continues from the last time it knew, however long it was off. Two clocks that
     # agree on the time since the same boot are believed all the same.
     if age is not None and kept < saved_at - CLOCK_BEHIND_S:
         same_boot = uptime and saved_uptime and abs(uptime - saved_uptime - age) < CLOCKS_AGREE_S
         age = age if same_boot else None
-    return snapshot, age
+    return document["estimator"], age
 
 
 def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:
@@ -77,7 +73,7 @@ def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:
 def write(file: Path, text: bytes) -> None:
     """Write a state file and keep the one before it; a power cut leaves at least one of them whole.
 
-    The folder is made if need be. OSError if the file cannot be written.
+    Makes the folder if there is none. OSError if the file cannot be written.
     """
     file, previous = copies(file)
     new = file.with_suffix(".new")
@@ -88,8 +84,7 @@ def write(file: Path, text: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
     except OSError:
-        with contextlib.suppress(OSError):
-            new.unlink()
+        new.unlink(missing_ok=True)
         raise
     with contextlib.suppress(FileNotFoundError):
         file.replace(previous)
@@ -108,14 +103,13 @@ def load(
 ) -> tuple[Mapping[str, Any], float | None] | None:
     """`decode` one file; None if there is no such file. ValueError if it cannot be read or is damaged."""
     try:
-        if not file.exists():
-            return None
-        if not file.is_file():
-            raise ValueError("cannot be read: it is not a file")
         with file.open("rb") as stream:
-            return decode(stream.read(LARGEST_FILE_BYTES), time, uptime, kept)
+            text = stream.read(LARGEST_FILE_BYTES)
+    except FileNotFoundError:
+        return None
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
+    return decode(text, time, uptime, kept)
 
 
 def sync_directory(directory: Path) -> None:

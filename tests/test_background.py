@@ -17,7 +17,6 @@ def test_calls_are_made_in_their_order_and_elsewhere():
         assert background.call(lambda n: made.append((n, threading.current_thread().name)), number)
     assert background.close(30)
     assert made == [(number, "test") for number in range(100)]
-    assert not background.call(print)
 
 
 def test_no_more_waits_than_the_limit_and_what_weighs_nothing_always_may():

@@ -78,7 +78,7 @@ def test_what_is_wrong_is_named_and_changes_nothing(line, message, pipeline):
 
 def test_clients_that_stall_or_flood_are_left(listening, monkeypatch):
     monkeypatch.setattr(control, "MAX_REQUEST_BYTES", 100_000)
-    monkeypatch.setattr(control._Client, "timeout", 0.2)
+    monkeypatch.setattr(control, "TIMEOUT_S", 0.2)
     _, path = listening
     for sent, answer in ((b'{"status"', b""), (b"x" * 150_000, b"longer than 100000 bytes")):
         with socket.socket(socket.AF_UNIX) as client:

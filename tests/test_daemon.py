@@ -239,9 +239,10 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
     assert before is not None
     saved = state_of(file)
     with Scene(bus, state_file=file) as scene:
-        scene.ride(2.0)  # it waits for an odometer that does not come
+        estimator = scene.daemon.pipeline.estimator
+        scene.ride(10.0, lambda: estimator.filter is not None)  # it waits for an odometer that does not come
         assert "continuing from the state saved" in caplog.text
-        after = scene.daemon.pipeline.estimator.filter
+        after = estimator.filter
     assert after is not None
     assert after.soc == pytest.approx(before.soc, abs=1e-3)
     assert state_of(file)["saved_at"] > saved["saved_at"]  # type: ignore[operator]
@@ -305,7 +306,7 @@ def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     daemon.stop()
     daemon.run()
     assert said in caplog.text
-    assert "not used, kept as" in caplog.text
+    assert "saved state not used, kept as" in caplog.text
     assert is_fresh(daemon)
     (aside,) = tmp_path.iterdir()  # nothing is known yet, so nothing is saved
     assert aside.read_bytes() == text
@@ -388,7 +389,7 @@ def test_whatever_restoring_raises_it_begins_afresh(
     monkeypatch.setattr(Estimator, "restore", half)
     daemon = Daemon(reference(), [], None, file)
     assert daemon.restore() is None
-    assert "in the middle: not used" in caplog.text
+    assert "in the middle" in caplog.text
     assert is_fresh(daemon)
 
 

@@ -13,54 +13,54 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard import notify
+from gz_onboard.notify import notify, watchdog_interval
 
 
 @pytest.fixture(params=["path", "abstract"])
-def listener(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[socket.socket, dict[str, str]]]:
-    """A bound socket like systemd's and the environment that names it."""
+def listener(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[socket.socket]:
+    """A bound socket like systemd's, which the environment names."""
     name = str(tmp_path / "notify") if request.param == "path" else f"@gz-onboard-{secrets.token_hex(8)}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
         server.bind(name.replace("@", "\0", 1))
         server.settimeout(5)
-        yield server, {"NOTIFY_SOCKET": name}
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        yield server
 
 
-def test_each_message_arrives_as_systemd_reads_it(listener):
-    server, environ = listener
-    sent = [
-        (notify.ready("on vcan0", environ), b"READY=1\nSTATUS=on vcan0"),
-        (notify.ready(environ=environ), b"READY=1"),
-        (notify.alive(environ), b"WATCHDOG=1"),
-        (notify.status("range 41 km\n", environ), b"STATUS=range 41 km"),
-        (notify.stopping("log closed", environ), b"STOPPING=1\nSTATUS=log closed"),
-    ]
-    for was_sent, expected in sent:
-        assert was_sent
-        assert server.recv(4096) == expected
+def test_each_message_arrives_as_systemd_reads_it(listener: socket.socket):
+    assert notify(READY=1, STATUS="on vcan0")
+    assert listener.recv(4096) == b"READY=1\nSTATUS=on vcan0"
+    assert notify(WATCHDOG=1)
+    assert listener.recv(4096) == b"WATCHDOG=1"
 
 
 @given(st.text(st.characters(codec="utf-8"), max_size=200))
-def test_a_status_never_becomes_another_field(text):
-    with tempfile.TemporaryDirectory() as directory, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+def test_a_status_never_becomes_another_field(text: str):
+    with (
+        tempfile.TemporaryDirectory() as directory,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server,
+        pytest.MonkeyPatch.context() as patch,
+    ):
         server.bind(f"{directory}/notify")
-        assert notify.status(text, {"NOTIFY_SOCKET": f"{directory}/notify"})
+        patch.setenv("NOTIFY_SOCKET", f"{directory}/notify")
+        assert notify(STATUS=text)
         message = server.recv(4096).decode()
     assert message.startswith("STATUS=")
     assert message.splitlines() == [message]
 
 
-def test_nobody_listens(tmp_path):
-    assert not notify.ready(environ={})
-    assert not notify.ready(environ={"NOTIFY_SOCKET": ""})
-    assert not notify.ready(environ={"NOTIFY_SOCKET": str(tmp_path / "gone")})
-    assert not notify.ready(environ={"NOTIFY_SOCKET": "@gz-onboard-gone"})
-    assert not notify.ready(environ={"NOTIFY_SOCKET": "vsock:2:1234"})
+@pytest.mark.parametrize("address", [None, "", "/nowhere/notify", "@gz-onboard-gone", "vsock:2:1234"])
+def test_nobody_listens(monkeypatch: pytest.MonkeyPatch, address: str | None):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    if address is not None:
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+    assert not notify(READY=1)
 
 
-def test_a_full_socket_does_not_block(listener):
-    _, environ = listener
-    assert any(not notify.alive(environ) for _ in range(10_000))
+def test_a_full_socket_does_not_block(listener: socket.socket):
+    assert any(not notify(WATCHDOG=1) for _ in range(10_000))
 
 
 @pytest.mark.parametrize(
@@ -74,5 +74,11 @@ def test_a_full_socket_does_not_block(listener):
         ({}, None),
     ],
 )
-def test_watchdog_interval_is_half_the_timeout(environ, expected):
-    assert notify.watchdog_interval(environ) == expected
+def test_watchdog_interval_is_half_the_timeout(
+    monkeypatch: pytest.MonkeyPatch, environ: dict[str, str], expected: float | None
+):
+    for name in ("WATCHDOG_USEC", "WATCHDOG_PID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environ.items():
+        monkeypatch.setenv(name, value)
+    assert watchdog_interval() == expected

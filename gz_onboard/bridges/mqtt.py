@@ -16,12 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gz_onboard import __version__, notify
+from gz_onboard import __version__
 from gz_onboard.dashboard.live import add_source, live, report, view_of
 from gz_onboard.dashboard.view import ALERTS, Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError
 from gz_onboard.events import Activity, State
 from gz_onboard.imports import require
+from gz_onboard.notify import notify
 
 EVERY_S, AT_LEAST_S = 1.0, 10.0  # between two states at least, and at most where nothing has changed
 EXPIRES_S = 30  # after which the broker drops a state, and Home Assistant shows none
@@ -112,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     broker = Broker(arguments.broker, name, will, partial(report, "mqtt"), tls=arguments.tls, login=login)
     with live(view_of(arguments, own_frames=True), arguments) as pictures, closing(broker):
         broker.start()
-        notify.ready(f"{arguments.channel} ({arguments.interface}) to {broker} as {name}")
+        notify(READY=1, STATUS=f"{arguments.channel} ({arguments.interface}) to {broker} as {name}")
         announced, sent, sent_at = 0, None, -math.inf
         for picture in pictures:
             now, connections, state = time.monotonic(), broker.connections, state_of(picture)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import fcntl
 import logging
 import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 from gz_onboard.bus.channel import CanChannel
@@ -37,29 +35,40 @@ log = logging.getLogger("gz-onboard")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard run``."""
     add_shared(parser, "--vehicle", "--vehicle-id", "--interface")
-    add = parser.add_argument
-    channel = f"channel of the vehicle's bus (default: {CHANNEL}); repeat for a second bus"
-    add_shared(parser, "--channel", action="append", default=None, help=channel)
+    channels = f"channel of the vehicle's bus (default: {CHANNEL}); repeat for a second bus"
+    add_shared(parser, "--channel", action="append", default=None, help=channels)
     add_shared(parser, "--payload", help="mass of rider and luggage (default: from the vehicle file)")
     add_shared(parser, "--effects", "--filter", "--route")
     logs, states, runtime = map(_directory, ("LOGS_DIRECTORY", "STATE_DIRECTORY", "RUNTIME_DIRECTORY"))
+    add = parser.add_argument
     add("--log-dir", type=Path, default=logs, metavar="DIR", help="folder for MCAP logs (default: none)")
-    total = "delete the oldest logs beyond this size (default: %(default)g)"
-    add("--log-total-mb", type=number("--log-total-mb", *LOG_TOTAL_MB, "MB"), default=2048, metavar="MB", help=total)
+    add(
+        "--log-total-mb",
+        type=number("--log-total-mb", *LOG_TOTAL_MB, "MB"),
+        default=2048,
+        metavar="MB",
+        help="delete the oldest logs beyond this size (default: %(default)g)",
+    )
     add("--state-dir", type=Path, default=states, metavar="DIR", help="folder for the saved state (default: none)")
-    rider = "name of the rider; habits are learned per rider (default: the last one, or a signal of the bus)"
-    add("--rider", type=_rider, metavar="NAME", help=rider)
-    control = "socket on which `gz-onboard route` gives a route (default: none)"
-    path = runtime / SOCKET.name if runtime else None
-    add("--control-socket", type=Path, default=path, metavar="PATH", help=control)
-    write_dbc = "write the DBC file of the vehicle's range frames, and end"
-    add("--write-dbc", type=Path, metavar="FILE", help=write_dbc)
+    add(
+        "--rider",
+        type=_rider,
+        metavar="NAME",
+        help="name of the rider; habits are learned per rider (default: the last one, or a signal of the bus)",
+    )
+    add(
+        "--control-socket",
+        type=Path,
+        default=runtime and runtime / SOCKET.name,
+        metavar="PATH",
+        help="socket on which `gz-onboard route` gives a route (default: none)",
+    )
+    add("--write-dbc", type=Path, metavar="FILE", help="write the DBC file of the vehicle's range frames, and end")
     add("--all-frames", action="store_true", help="also receive, count and log identifiers not in the DBC files")
 
 
 def _rider(text: str) -> str:
-    most = CONSUMPTION.most_name_letters
-    if not text or len(text) > most:
+    if not 1 <= len(text) <= (most := CONSUMPTION.most_name_letters):
         raise argparse.ArgumentTypeError(f"must be a name of 1 to {most} letters, is {shown(text)}")
     return text
 
@@ -96,21 +105,28 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
     route = read_route(arguments.route) if arguments.route else None
-    recorder = _recorder(arguments, vehicle) if arguments.log_dir else None
+    missing = lacking(vehicle)
+    recorder = None
+    if arguments.log_dir:
+        metadata = {"vehicle_key": vehicle.key, "lacking": " ".join(missing)}
+        if arguments.payload is not None:
+            metadata["payload_kg"] = f"{arguments.payload:g}"
+        total = round(arguments.log_total_mb * 1e6)
+        limits = LogLimits(max_file_bytes=LOG_FILE_BYTES, max_age_s=LOG_FILE_S, max_total_bytes=total)
+        recorder = Recorder(arguments.log_dir, vehicle.name, metadata, dbc_texts(vehicle), limits)
     identifiers = None if arguments.all_frames else known_identifiers(vehicle.mapping)
     if identifiers is not None:  # our own too: another sender of them is reported
         identifiers += sorted(vehicle.publisher().identifiers)
     channels = [CanChannel(arguments.interface, name, index, identifiers) for index, name in enumerate(names)]
     for channel in channels:
         channel.open()
-    if missing := lacking(vehicle):
+    if missing:
         log.info("%s has wider intervals, because it has no sensors for: %s", vehicle.name, ", ".join(missing))
-    saved = state_file(arguments.state_dir, vehicle.name) if arguments.state_dir else None
     daemon = Daemon(
         vehicle,
         channels,
         recorder,
-        saved,
+        state_file(arguments.state_dir, vehicle.name) if arguments.state_dir else None,
         filter_name=arguments.filter,
         control_socket=arguments.control_socket,
         rider=arguments.rider or "",
@@ -132,16 +148,6 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     return OK
 
 
-def _recorder(arguments: argparse.Namespace, vehicle: Vehicle) -> Recorder:
-    metadata = {"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle))}
-    if arguments.payload is not None:
-        metadata["payload_kg"] = f"{arguments.payload:g}"
-    limits = LogLimits(
-        max_file_bytes=LOG_FILE_BYTES, max_age_s=LOG_FILE_S, max_total_bytes=round(arguments.log_total_mb * 1e6)
-    )
-    return Recorder(arguments.log_dir, vehicle.name, metadata=metadata, attachments=dbc_texts(vehicle), limits=limits)
-
-
 def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | None) -> None:
     """Hold the channels and the state folder until `locks` is left, or the process ends.
 
@@ -150,30 +156,22 @@ def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | 
     # Abstract socket names belong to the network namespace, as the interfaces do; a virtual bus is the process' own.
     for name in names if interface != "virtual" else ():
         holder = locks.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        taken = InputError(f"--channel {name}: another gz-onboard run has it; two would send the same identifiers")
-        with _lock_taken(taken):
+        try:
             holder.bind(f"\0gz-onboard:{interface}:{name}"[:107])
+        except OSError as error:
+            why = "another gz-onboard run has it; two would send the same identifiers"
+            raise InputError(f"--channel {name}: {why}") from error
     if state_dir is None:
         return
     try:
         state_dir.mkdir(parents=True, exist_ok=True)
         folder = os.open(state_dir, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError:  # nothing can be saved there either, and the daemon reports that
-        return
-    locks.callback(os.close, folder)
-    with _lock_taken(InputError(f"--state-dir {state_dir}: another gz-onboard run uses it; give each its own")):
+        locks.callback(os.close, folder)
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-@contextmanager
-def _lock_taken(taken: InputError) -> Iterator[None]:
-    """Raise `taken` if another process has the lock; where there are no locks, continue without."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.EADDRINUSE, errno.EWOULDBLOCK):
-            raise taken from error
-        log.warning("without a lock: %s", error)
+    except BlockingIOError as error:
+        raise InputError(f"--state-dir {state_dir}: another gz-onboard run uses it; give each its own") from error
+    except OSError as error:  # no state can be saved there either, and the daemon reports that
+        log.warning("--state-dir %s: cannot be locked: %s", state_dir, error.strerror)
 
 
 def summary(pipeline: Pipeline) -> list[str]:

@@ -10,16 +10,17 @@ from __future__ import annotations
 import json
 import logging
 import os
-import socketserver
+import socket
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
 
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.estimator.route import PreparedRoute
+from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.routes.columns import MIN_ROWS, Columns
 from gz_onboard.routes.route import ROUTE_COLUMNS, Route, route_of
@@ -40,7 +41,7 @@ class Control:
         self._path, self._pipeline = path, pipeline
         self._ready: SimpleQueue[PreparedRoute | None] = SimpleQueue()  # for the daemon's loop to take
         self._name: str | None = None
-        self._server: _Server | None = None
+        self._socket: socket.socket | None = None
 
     def start(self) -> None:
         """Listen, if there is a path. InputError if that is impossible."""
@@ -50,12 +51,14 @@ class Control:
         try:
             if self._path.is_socket():  # of a daemon that has crashed: a running one holds the bus
                 self._path.unlink()
-            self._server = _Server(str(self._path), self.answer)
+            self._socket = socket.socket(socket.AF_UNIX)
+            self._socket.bind(str(self._path))
+            self._socket.listen()
         except OSError as error:
             raise InputError(f"{self._path}: cannot listen there: {error.strerror or error}") from error
         finally:
             os.umask(before)
-        threading.Thread(target=self._server.serve_forever, name="control", daemon=True).start()
+        threading.Thread(target=self._accept, args=(self._socket,), name="control", daemon=True).start()
 
     def give(self, route: Route | None) -> None:
         """Prepare `route`, which may take seconds, for the daemon's loop to take; in any thread."""
@@ -72,13 +75,35 @@ class Control:
 
     def close(self) -> None:
         """Stop listening."""
-        if self._server and self._path:
-            self._server.shutdown()
-            self._server.server_close()
+        if self._socket and self._path:
             self._path.unlink(missing_ok=True)
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread that accepts clients
+            self._socket.close()
+
+    def _accept(self, listening: socket.socket) -> None:
+        with suppress(OSError):  # closed
+            while True:
+                client, _ = listening.accept()
+                threading.Thread(target=self._converse, args=(client,), daemon=True).start()
+
+    def _converse(self, client: socket.socket) -> None:
+        """Answer the one request of a client. A client that stalls or goes away is left."""
+        with suppress(OSError), client, client.makefile("rwb") as stream:
+            client.settimeout(TIMEOUT_S)
+            line = stream.readline(MAX_REQUEST_BYTES + 1)
+            try:
+                answer = self.answer(line)
+            except InputError as error:
+                answer = {"error": str(error)}
+            except Exception as error:  # the client learns that its request was not carried out
+                log.exception("control socket")
+                answer = {"error": f"failed: {error!r}"}
+            stream.write(json.dumps(answer).encode() + b"\n")
 
     def answer(self, line: bytes) -> dict[str, object]:
         """Carry out a request and return the answer. InputError for a bad request."""
+        if len(line) > MAX_REQUEST_BYTES:
+            raise InputError(f"is longer than {MAX_REQUEST_BYTES} bytes")
         try:
             request = json.loads(line, parse_int=float)  # a float cannot have thousands of digits
         except (ValueError, RecursionError) as error:
@@ -96,9 +121,7 @@ class Control:
         return {"ok": True, "route": route.name, "length_m": round(route.length), "grade_known": route.grade_known}
 
     def _status(self) -> dict[str, object]:
-        last = self._pipeline().last
-        if last is None:
-            return {"route": self._name, "state": "NONE"}
+        last = self._pipeline().last or Estimate(0.0)
         return {
             "route": self._name,
             "state": last.route_state.name,
@@ -113,40 +136,6 @@ class Control:
             "battery_ends_longitude": last.battery_ends_longitude,
             "range_m": last.range,
         }
-
-
-class _Server(socketserver.ThreadingUnixStreamServer):
-    """Passes each request line to `answer`."""
-
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, path: str, answer: Callable[[bytes], dict[str, object]]) -> None:
-        self.answer = answer
-        super().__init__(path, _Client)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore clients that stall or go away."""
-
-
-class _Client(socketserver.StreamRequestHandler):
-    """One connection, for one request."""
-
-    server: _Server
-    timeout = TIMEOUT_S
-
-    def handle(self) -> None:
-        line = self.rfile.readline(MAX_REQUEST_BYTES + 1)
-        try:
-            if len(line) > MAX_REQUEST_BYTES:
-                raise InputError(f"is longer than {MAX_REQUEST_BYTES} bytes")
-            answer = self.server.answer(line)
-        except InputError as error:
-            answer = {"error": str(error)}
-        except Exception as error:  # the client learns that its request was not carried out
-            log.exception("control socket")
-            answer = {"error": f"failed: {error!r}"}
-        self.wfile.write(json.dumps(answer).encode() + b"\n")
 
 
 def route_of_request(request: object) -> Route:
@@ -175,6 +164,5 @@ def route_of_request(request: object) -> Route:
     count = min(lengths.values(), default=0)
     if count < MIN_ROWS:
         raise InputError(f"route: has {count} points, must have at least {MIN_ROWS}")
-    values = {column: tuple(numbers) for column, numbers in columns.items()}
     places = tuple(f"route, point {point + 1}" for point in range(count))
-    return route_of(Columns("route", places, values), name)
+    return route_of(Columns("route", places, {column: tuple(numbers) for column, numbers in columns.items()}), name)

@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from math import sqrt
 from pathlib import Path
@@ -39,7 +39,7 @@ MEANING = {  # by name: what its factor is relative to
     "pace": "time per kilometre, relative to the prior",
     "factor": "measured over modelled energy of the same motion",
 }
-RESETS = {"battery": ("battery",), "riding": ("riding",), "all": ("battery", "riding")}
+RESETS = {"battery": ("learned",), "riding": ("riding",), "all": ("learned", "riding")}  # parts of the saved state
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,23 +89,19 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
     with _usable(file):
         snapshot, age = _load(file)
         check_vehicle(snapshot, vehicle.key)
-    fresh = {"battery": {"learned": new.learned_snapshot()}, "riding": {"riding": new.forecaster.snapshot()}}
-    changed = dict(snapshot)
-    for part in RESETS[what]:
-        changed |= fresh[part]
-    with writing(file):
+    fresh = {"learned": new.learned_snapshot(), "riding": new.forecaster.snapshot()}
+    changed = {**snapshot, **{part: fresh[part] for part in RESETS[what]}}
+    with ExitStack() as held, writing(file):
         folder = os.open(state.copies(file)[0].parent, os.O_RDONLY | os.O_DIRECTORY)
+        held.callback(os.close, folder)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            state.write(file, state.encode(changed, 0.0 if age is None else time.time() - age))
         except BlockingIOError as error:
             raise InputError(f"{file}: the running daemon would overwrite it; stop it first") from error
-        finally:
-            os.close(folder)
+        state.write(file, state.encode(changed, 0.0 if age is None else time.time() - age))
 
 
 def _load(file: Path) -> tuple[Mapping[str, Any], float | None]:
-    """Snapshot and age [s] of a state. ValueError if there is none, or if it is damaged."""
     found = state.load(file, time.time())
     if found is None:
         raise ValueError("no saved state; the daemon keeps one in its state folder")
@@ -114,12 +110,11 @@ def _load(file: Path) -> tuple[Mapping[str, Any], float | None]:
 
 @contextmanager
 def _usable(file: Path) -> Iterator[None]:
-    """InputError, which names the `file` and what to do, for a state that cannot be used."""
+    """InputError, which names the `file` and a remedy, for a state that cannot be used."""
     try:
         yield
     except ValueError as error:
-        hint = "choose another state file or vehicle"
-        raise InputError(f"{file}: {error}; {hint}") from error
+        raise InputError(f"{file}: {error}; choose another state file or vehicle") from error
 
 
 def battery_learned(estimator: Estimator) -> dict[str, Learned]:
@@ -148,11 +143,9 @@ def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[st
     lines = ["per cent learned: share of the initial uncertainty that is gone"]
     lines += [_line(name, x) for name, x in battery.items()]
     for rider, habits in riders.items():
-        if len(riders) > 1:
-            if not rider and not any(x.share for x in habits.values()):
-                continue
-            lines.append(f"rider {rider}:" if rider else "rides without a known rider:")
-        lines += [_line(name, x) for name, x in habits.items()]
+        if len(riders) == 1 or rider or any(x.share for x in habits.values()):
+            heading = f"rider {rider}:" if rider else "rides without a known rider:"
+            lines += [heading] * (len(riders) > 1) + [_line(name, x) for name, x in habits.items()]
     return "\n".join(lines)
 
 

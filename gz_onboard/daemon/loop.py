@@ -11,11 +11,11 @@ import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping
+from math import inf
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from gz_onboard import notify
 from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import Recorder
@@ -23,6 +23,7 @@ from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import StateKeeper
 from gz_onboard.events import Frame, Reason, State
 from gz_onboard.log_rows import reason_names
+from gz_onboard.notify import notify, watchdog_interval
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle
 
@@ -66,7 +67,7 @@ class Daemon:
         self._offset = _wall_offset()
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         self._reported_at = 0.0
-        self._reported: dict[str, str] = {}  # by subject: the text that was last logged
+        self._reported: dict[str, str] = {}  # by subject: its text a second ago
 
     def stop(self, *_: object) -> None:
         """End after the present tick."""
@@ -79,31 +80,29 @@ class Daemon:
         """
         try:
             self._loop()
-            notify.stopping()
+            notify(STOPPING=1)
             self.tick()  # frames that waited for theirs
         finally:
             self.close()
 
     def _loop(self) -> None:
         self.restore()
-        watchdog = notify.watchdog_interval()
+        watchdog = watchdog_interval() or inf
         fed = next_tick = time.monotonic()
         busy = False
-        notify.ready("waiting for frames")
+        notify(READY=1, STATUS="waiting for frames")
         log.info("ready after %.2f s of CPU", time.process_time())
         while not self._stopping:
-            next_tick += TICK / 2 if busy else TICK
-            pause = next_tick - time.monotonic()
-            if pause > 0:
-                time.sleep(pause)
-            else:  # overloaded or suspended: do not try to catch up
-                next_tick -= pause
-            busy = self.tick() > BUSY
             now = time.monotonic()
-            if watchdog and now - fed >= watchdog:
-                fed = now
-                notify.alive()
-            self._report(now)
+            next_tick = max(next_tick + (TICK / 2 if busy else TICK), now)  # overloaded or suspended: no catching up
+            time.sleep(next_tick - now)
+            busy = self.tick() > BUSY
+            if next_tick - fed >= watchdog:
+                fed = next_tick
+                notify(WATCHDOG=1)
+            if next_tick - self._reported_at >= 1.0:
+                self._reported_at = next_tick
+                self._report()
 
     def close(self) -> None:
         """Save the state, finish the log as far as the disks allow in time, and close the channels."""
@@ -157,10 +156,8 @@ class Daemon:
         self._overrun += len(frames) - len(kept)
         began = time.thread_time()
         self.step(kept, now_ns)
-        if len(kept) > BUSY:
+        if len(kept) > BUSY:  # with fewer the estimates cost more than the frames
             self._frame_s += 0.2 * ((time.thread_time() - began) / len(kept) - self._frame_s)
-        else:  # with so few the estimates cost more than the frames
-            self._frame_s = max(0.98 * self._frame_s, FRAME_S)
         return len(frames)
 
     def step(self, frames: list[Frame], now_ns: int) -> None:
@@ -187,40 +184,35 @@ class Daemon:
         if self._keeper:
             self._keeper.save_if_due(pipeline, now_ns)
 
-    def _report(self, now: float) -> None:
-        """Give systemd the status and log what changed, at most once a second."""
-        if now - self._reported_at < 1.0:
-            return
-        self._reported_at = now
-        error = self._log.last_error if self._log and self._log.failing else ""
-        if self._is_news("log", error):
-            log.warning("cannot write the log: %s", error)
-        if self._is_news("state", "stuck" if self._keeper and self._keeper.stuck else ""):
-            log.warning("cannot save the state: the disk does not answer")
-        if self._is_news("foreign", "foreign" if self.pipeline.foreign else ""):
-            log.warning("%s", foreign_text(self.pipeline))
-        last = self.pipeline.last
-        if last is None:
-            return
-        counts = self.pipeline.counts()
-        state, remaining, _, _ = self.pipeline.publisher.reported(last)
-        text = state_text(state, last.reasons)
-        if self._is_news("estimate", text):
-            log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
-        if remaining is not None and last.soc is not None:
-            text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
-        notify.status(text)
-
-    def _is_news(self, subject: str, text: str) -> bool:
-        """Whether there is a `text` about `subject`, other than the last one."""
-        before, self._reported[subject] = self._reported.get(subject, ""), text
-        return bool(text) and text != before
+    def _report(self) -> None:
+        """Give systemd the status, and log what has changed."""
+        pipeline, last = self.pipeline, self.pipeline.last
+        said = {}
+        if self._log and self._log.failing:
+            said["log"] = f"cannot write the log: {self._log.last_error}"
+        if self._keeper and self._keeper.stuck:
+            said["state"] = "cannot save the state: the disk does not answer"
+        if pipeline.foreign:
+            said["foreign"] = foreign_text(pipeline)
+        if last is not None:
+            state, remaining, _, _ = pipeline.publisher.reported(last)
+            said["estimate"] = text = state_text(state, last.reasons)
+            if remaining is not None and last.soc is not None:
+                text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
+            notify(STATUS=text)
+        counts = pipeline.counts()
+        for subject, text in said.items():
+            if text != self._reported.get(subject) and subject == "estimate":
+                log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
+            elif text != self._reported.get(subject):
+                log.warning("%s", text)
+        self._reported = said
 
 
 def foreign_text(pipeline: Pipeline) -> str:
     """Warn of another sender on the identifiers of our own frames."""
-    counted = ", ".join(f"{identifier} {count} times" for identifier, count in pipeline.foreign.items())
-    return f"someone else sends on the identifiers of the range frames ({counted}): give others, by range_identifier"
+    found = ", ".join(pipeline.foreign)
+    return f"someone else sends on the identifiers of the range frames ({found}): give others, by range_identifier"
 
 
 def fair_share(frames: list[Frame], most: int) -> list[Frame]:

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from gz_onboard import notify
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.dashboard.view import NO_NEWS, Picture, View
 from gz_onboard.errors import InputError, not_an_input
+from gz_onboard.notify import notify, watchdog_interval
 from gz_onboard.options import add_shared, number
 from gz_onboard.vehicle import read_vehicle
 
@@ -74,7 +74,7 @@ def pictures(view: View, channel: CanChannel, stopped: Callable[[], bool]) -> It
     """Drain the channel into the view until it is time to stop: a picture when it has changed, and each second."""
     shown: Picture = {}
     looked = given = fed = -math.inf
-    interval = notify.watchdog_interval() or math.inf
+    interval = watchdog_interval() or math.inf
     while not stopped():
         frames = channel.drain()
         now = clock()
@@ -88,10 +88,10 @@ def pictures(view: View, channel: CanChannel, stopped: Callable[[], bool]) -> It
                 shown, given = news, now
                 yield picture
         if now - fed >= interval:
-            notify.alive()
+            notify(WATCHDOG=1)
             fed = now
         time.sleep(POLL_S)
-    notify.stopping()
+    notify(STOPPING=1)
 
 
 def clock() -> float:
@@ -118,7 +118,7 @@ def report(command: str, text: str) -> None:
     """Say `text` on standard output, where there is one, and to systemd."""
     if sys.stdout is not None:
         print(f"{command}: {text}", flush=True)
-    notify.ready(text)
+    notify(READY=1, STATUS=text)
 
 
 def host_and_port(text: str, port: int | None = None) -> tuple[str, int]:

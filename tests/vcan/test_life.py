@@ -231,7 +231,8 @@ def test_a_damaged_state_is_set_aside(begin: Begin):
     rows = hours.live(scooter.live(100, 11.0))
     hours.stop(daemon)
 
-    assert "is damaged: its checksum is wrong: not used, kept as" in daemon.journal
+    assert "saved state not used, kept as" in daemon.journal
+    assert "is damaged: its checksum is wrong" in daemon.journal
     assert file.with_name(f"{file.name}.refused").read_bytes() == text
     first = charge_known(rows)[0]
     assert first["RANGE_PriorRiding"] == 1
