@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
@@ -126,18 +125,6 @@ def estimate_row(estimate: Estimate) -> dict[str, object]:
     return row
 
 
-def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
-    """Of each field of a row its column in a table, ``name[unit]``: the unit is the description's first word.
-
-    The field ``time``, since the first frame, is ``elapsed``: a table's first column is the time of the log.
-    """
-    columns = {}
-    for name, text in descriptions.items():
-        unit = re.split(r"[ ,]", text)[0]
-        columns[name] = ("elapsed" if name == "time" else name) + (f"[{unit}]" if unit not in ("", "1") else "")
-    return columns
-
-
 def explanation_row(why: Explanation) -> dict[str, object]:
     """Return an explanation as a row: causes by name."""
     causes = {cause.name.lower(): size for cause, size in why.causes.items()}
@@ -213,16 +200,18 @@ def estimate_schema() -> dict[str, Any]:
 def declare(log: Log, messages: Sequence[Message]) -> None:
     """Declare the topics of a log; messages: those whose decoded signals are logged, too."""
     log.channel(ESTIMATE_TOPIC, estimate_schema())
-    units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
-    for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
-        schema = object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units)
-        schema["properties"] |= {"forgotten": {"type": "string"}} if topic == CHANGE_TOPIC else {}
-        log.channel(topic, schema)
-    counts = {name: {"type": "integer"} for name in COUNTS}
-    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
-    reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
-    objects = {"ride": object_schema("gz_onboard.Ride", RIDE_UNITS), "learned": {"type": "object"}}
-    properties = counts | maps | reasons | objects
+    causes = [cause.name.lower() for cause in Cause if cause]
+    units = {"time": ESTIMATE_UNITS["time"], **dict.fromkeys(("reference", "range", *causes), "m")}
+    log.channel(WHY_TOPIC, object_schema("gz_onboard.Why", units))
+    change = object_schema("gz_onboard.RangeChange", units)
+    change["properties"] |= {"forgotten": {"type": "string"}}
+    log.channel(CHANGE_TOPIC, change)
+    properties = {
+        **{name: {"type": "integer"} for name in COUNTS},
+        **{name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "learned")},
+        "reasons": {"type": "array", "items": {"type": "string"}},
+        "ride": object_schema("gz_onboard.Ride", RIDE_UNITS),
+    }
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": properties})
     log.channel(BATTERY_ENDS_TOPIC, LOCATION_SCHEMA)
     if messages:

@@ -23,6 +23,11 @@ LARGEST_FILE_BYTES = 1 << 20  # a state has some thousand
 _HEAD = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 
 
+def state_file(directory: Path, vehicle: str) -> Path:
+    """Return the path of the saved state of the vehicle with this name."""
+    return directory / (re.sub(r"[^\w.+-]+", "-", vehicle) + ".json")
+
+
 def encode(snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> bytes:
     """Encode a snapshot taken at `time` [s since the epoch], `uptime` [s] after the system started.
 

@@ -19,10 +19,10 @@ from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_throug
 from gz_onboard.lab.estimate_state import held, text_of
 from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
-from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log, table_columns
+from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.signal_table import SignalTable
-from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
+from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of, table_columns
 from gz_onboard.progress import Progress
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle

@@ -15,7 +15,6 @@ from pathlib import Path
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import LogLimits, Recorder
-from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import Daemon, foreign_text, state_text
 from gz_onboard.daemon.route import SOCKET
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
@@ -24,6 +23,7 @@ from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.effect import ROOT
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.routes.route import read_route
+from gz_onboard.state import state_file
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOG_TOTAL_MB = 1e-3, 1e9  # bounds of the option

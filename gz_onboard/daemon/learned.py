@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard import state
-from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.consumption import Habits
@@ -54,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Reset parts of a state, if asked for, and show it. InputError for a state that cannot be used."""
     vehicle = read_vehicle(arguments.vehicle, vehicle_id=arguments.vehicle_id)
-    file = arguments.state or state_file(STATE_FOLDER, vehicle.name)
+    file = arguments.state or state.state_file(STATE_FOLDER, vehicle.name)
     not_an_input([arguments.json], [file, vehicle.file])
     if arguments.reset:
         reset(file, vehicle, arguments.reset)

@@ -254,7 +254,7 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
 
 def spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]:
     """(begin, length) of the stretches in which something is true; each estimate holds until the next."""
-    from gz_onboard.arrays import stretches
+    from gz_onboard.offline.arrays import stretches
 
     return [(x[i], x[min(j, len(x) - 1)] - x[i]) for i, j in stretches(true)]
 

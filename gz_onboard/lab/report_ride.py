@@ -113,7 +113,7 @@ def _series(samples: Samples, role: str) -> Series:
 
 def path_of(samples: Samples) -> list[list[Position]]:
     """Where the vehicle was, by a receiver with a fix; empty without one, and without two positions."""
-    from gz_onboard.arrays import held_at
+    from gz_onboard.offline.arrays import held_at
 
     if not {"latitude", "longitude"} <= samples.columns.keys():
         return []

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, block_means, running_mean
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components, losses
@@ -34,6 +34,7 @@ from gz_onboard.lab.validate_score import (
     split,
 )
 from gz_onboard.lab.validate_soc import soc_reference
+from gz_onboard.offline.arrays import block_means, running_mean
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.progress import Progress

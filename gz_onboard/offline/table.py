@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -93,3 +94,15 @@ def array_of(values: Sequence[object]) -> NDArray[Any]:
         return np.array(values, dtype=bool)
     numbers = [float(value) if isinstance(value, int | float) else np.nan for value in values]
     return np.array(numbers, dtype=float)
+
+
+def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
+    """Return the column of each field of a row, ``name[unit]``: the unit is the first word of its description.
+
+    The field ``time``, since the first frame, is ``elapsed``: a table's first column is the time of the log.
+    """
+    columns = {}
+    for name, text in descriptions.items():
+        unit = re.split(r"[ ,]", text)[0]
+        columns[name] = ("elapsed" if name == "time" else name) + (f"[{unit}]" if unit not in ("", "1") else "")
+    return columns

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array, block_means, held_at, running_mean
+from gz_onboard.arrays import Array
 from gz_onboard.bus.codec import LONGEST_PAUSE_NS
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate
+from gz_onboard.offline.arrays import block_means, held_at, running_mean
 from gz_onboard.offline.samples import open_ride, read_samples, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port

@@ -12,8 +12,9 @@ from math import nan
 
 import numpy as np
 
-from gz_onboard.arrays import Array, stretches
+from gz_onboard.arrays import Array
 from gz_onboard.errors import brief
+from gz_onboard.offline.arrays import stretches
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.beyond import LOADED, Beyond, beyond_pack

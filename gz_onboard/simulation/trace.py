@@ -8,8 +8,9 @@ from operator import attrgetter
 
 import numpy as np
 
-from gz_onboard.arrays import Array, running_mean
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
+from gz_onboard.offline.arrays import running_mean
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import shutil
+import time
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import is_complete
 from gz_onboard.cli import main
-from gz_onboard.daemon import keeper
+from gz_onboard.daemon import loop
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_order import span_of
@@ -81,8 +82,9 @@ def snapshot(file: Path) -> dict[str, Any]:
 def by_the_daemon(frames: list[Frame], file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames through a daemon that is started as they begin and stopped as they end, whose clock is theirs."""
     now = [frames[0][0]]
-    clock = SimpleNamespace(time=lambda: now[0] * 1e-9, clock_gettime=lambda _: now[0] * 1e-9, CLOCK_BOOTTIME=7)
-    monkeypatch.setattr(keeper, "time", clock)
+    theirs = {"time": lambda: now[0] * 1e-9, "clock_gettime": lambda _: now[0] * 1e-9}
+    clock = SimpleNamespace(**{**vars(time), **theirs})
+    monkeypatch.setattr(loop, "time", clock)
     monkeypatch.setattr(state, "kept_time", lambda: float("inf"))
     channel = CanChannel("virtual", str(file))
     channel.open()

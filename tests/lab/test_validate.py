@@ -17,7 +17,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.arrays import block_means
 from gz_onboard.cli import main
 from gz_onboard.lab.validate import KEYS, pool
 from gz_onboard.lab.validate_components import components
@@ -25,6 +24,7 @@ from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, split
 from gz_onboard.lab.validate_soc import soc_reference
+from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.model import Model

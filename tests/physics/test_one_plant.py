@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.arrays import block_means
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
@@ -22,6 +21,7 @@ from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
+from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear, bilinear_over, extended, extended_over, linear

@@ -18,7 +18,7 @@ from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 
 from gz_onboard import state
-from gz_onboard.daemon.keeper import state_file
+from gz_onboard.state import state_file
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.estimator.life import CELLS, INVERTER, MOTOR, OTHERS, PACK, PERIOD
 from tests.estimator.life import Scooter as Ridden

@@ -89,11 +89,7 @@ class PacedChannel(CanChannel):
 def run(pace: socket.socket, arguments: Sequence[str]) -> int:
     """The command, with its loop paced."""
     PacedChannel.clock = clock = PacedClock(pace)
-    with (
-        patch("gz_onboard.daemon.loop.time", clock),
-        patch("gz_onboard.daemon.keeper.time", clock),
-        patch("gz_onboard.daemon.command.CanChannel", PacedChannel),
-    ):
+    with patch("gz_onboard.daemon.loop.time", clock), patch("gz_onboard.daemon.command.CanChannel", PacedChannel):
         return main(list(arguments))
 
 

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, held_at
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
+from gz_onboard.offline.arrays import held_at
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.sensors import speed_role
 from gz_onboard.vehicle import Vehicle

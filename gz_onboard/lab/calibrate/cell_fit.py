@@ -18,10 +18,11 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from gz_onboard.arrays import Array, bends
+from gz_onboard.arrays import Array
 from gz_onboard.constants import KELVIN
 from gz_onboard.lab.calibrate.cell_circuit import follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
+from gz_onboard.offline.arrays import bends
 from gz_onboard.physics.functions import decay_over
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1

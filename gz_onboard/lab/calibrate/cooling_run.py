@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gz_onboard.arrays import Array, held_integral
+from gz_onboard.arrays import Array
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.manifest import AIRFLOWS
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import dissipation
 from gz_onboard.physics.cooling import PERIOD

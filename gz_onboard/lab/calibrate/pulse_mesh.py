@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, bends
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate.cell_fit import Branches, Pieces, Reduction, fit_branches, fit_direct, jackknife
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.pulse_test import Tested, ocv_and_slope
 from gz_onboard.lab.calibrate.result import Result
+from gz_onboard.offline.arrays import bends
 
 LEVEL = 0.15  # relative: how far a time constant may change over 0.1 of SOC
 POOLED = 0.1  # of SOC: how far the scatter of pulses is taken to be alike

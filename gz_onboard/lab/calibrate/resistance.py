@@ -10,13 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array, held_integral
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, score
 from gz_onboard.lab.calibrate.offsets import read_pair, window_means
 from gz_onboard.lab.calibrate.result import Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.lab.sizes import sizes_of
+from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, block_means
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.channels import CHANNEL, Channel
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values
+from gz_onboard.offline.arrays import block_means
 from gz_onboard.physics.effect import Effect
 
 WHOLE = 0.99  # of a block: rounding apart, all of it

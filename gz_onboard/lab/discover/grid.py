@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, running_mean
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
 from gz_onboard.lab.discover.stand_ins import PACK, delays, stand_ins
 from gz_onboard.lab.sizes import sizes_of
+from gz_onboard.offline.arrays import running_mean
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import air_density, total

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array, block_means, running_mean
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
+from gz_onboard.offline.arrays import block_means, running_mean
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port

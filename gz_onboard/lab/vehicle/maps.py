@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, block_means
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.motor import read_bench
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.validate_components import losses
+from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.sensors import road_speed, true_columns
