@@ -80,23 +80,13 @@ class _Parser(argparse.ArgumentParser):
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
             wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
-            bare = {option.lstrip("-"): option for option in self.known_options()}
+            bare = {option.lstrip("-"): option for action in self._actions for option in action.option_strings}
             near = closest(wrong.partition("=")[0].lstrip("-"), bare)  # the dashes that all have make none alike
             if near:
                 message += f" (did you mean {bare[near]!r}?)"
             elif not wrong and any(not action.option_strings for action in self._actions):
                 message += "; files go before the options"
         super().error(message)
-
-    def known_options(self) -> list[str]:
-        """Options of this command and of its subcommands."""
-        options: list[str] = []
-        for action in self._actions:
-            options += action.option_strings
-            if isinstance(action, argparse._SubParsersAction):
-                for parser in action.choices.values():
-                    options += parser.known_options()
-        return options
 
 
 def command_line(called: Collection[str]) -> argparse.ArgumentParser:
@@ -132,24 +122,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
         sys.stdout.flush()  # here, where a full disk is a message
         return status
-    except InputError as error:
-        print(f"gz-onboard {called}: {error}", file=sys.stderr)
-        _drop_output()
-        return BAD_INPUT
-    except ModuleNotFoundError as error:
-        if not (missing := missing_extra(error)):
-            raise
-        print(f"gz-onboard {called}: {missing}", file=sys.stderr)
-        return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output went away
         sys.stderr.close()
         return FAILED
-    except OSError as error:  # what is left is mostly a disk that is full
-        print(f"gz-onboard {called}: {error}", file=sys.stderr)
+    except (InputError, ModuleNotFoundError, OSError) as error:  # an OSError that is left is mostly a full disk
+        message = missing_extra(error) if isinstance(error, ModuleNotFoundError) else str(error)
+        if not message:
+            raise
+        print(f"gz-onboard {called}: {message}", file=sys.stderr)
         _drop_output()
-        return FAILED
+        return FAILED if isinstance(error, OSError) else BAD_INPUT
 
 
 def _drop_output() -> None:

@@ -130,10 +130,10 @@ def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
 
 def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
     learned = {}
-    for field in fields(Habits):
-        now, before = getattr(habits, field.name), getattr(prior, field.name)
-        sd, unknown = sqrt(now.level_variance), sqrt(before.level_variance)
-        learned[field.name] = Learned(now.level / before.level, sd / before.level, max(1 - sd / unknown, 0.0))
+    for name in (field.name for field in fields(Habits)):
+        now, before = getattr(habits, name), getattr(prior, name)
+        share = 1 - sqrt(now.level_variance / before.level_variance)
+        learned[name] = Learned(now.level / before.level, sqrt(now.level_variance) / before.level, max(share, 0.0))
     return learned
 
 

@@ -171,16 +171,14 @@ class Daemon:
         pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
         pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
         pipeline.overrun = self._overrun
-        reasons = Reason(0)
-        if not all(channel.up for channel in self.channels):
-            reasons |= Reason.BUS_DOWN
         if self._log:
             pipeline.log_lost = self._log.lost_frames
-            if self._log.failing:
-                reasons |= Reason.LOG_FAILED
-        if self._keeper and self._keeper.failing:
-            reasons |= Reason.SAVE_FAILED
-        pipeline.extra_reasons = reasons
+        problems = {
+            Reason.BUS_DOWN: not all(channel.up for channel in self.channels),
+            Reason.LOG_FAILED: self._log and self._log.failing,
+            Reason.SAVE_FAILED: self._keeper and self._keeper.error,
+        }
+        pipeline.extra_reasons = Reason(sum(reason for reason, found in problems.items() if found))
         self.control.take()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
@@ -195,8 +193,8 @@ class Daemon:
         said = {}
         if self._log and self._log.failing:
             said["log"] = f"cannot write the log: {self._log.last_error}"
-        if self._keeper and self._keeper.stuck:
-            said["state"] = "cannot save the state: the disk does not answer"
+        if self._keeper and (error := self._keeper.error):
+            said["state"] = f"cannot save the state: {error}"
         if pipeline.foreign:
             said["foreign"] = foreign_text(pipeline)
         if last is not None:
@@ -222,17 +220,12 @@ class StateKeeper:
         self.key = key
         self._thread = Background("state")
         self._saved_ns, self._saved_soc = 0, inf
-        self._failed = False
+        self._error = ""
 
     @property
-    def stuck(self) -> bool:
-        """Whether the disk does not answer."""
-        return self._thread.stuck > STATE_STUCK_S
-
-    @property
-    def failing(self) -> bool:
-        """Whether the state cannot be saved: an error, or a disk that does not answer."""
-        return self._failed or self.stuck
+    def error(self) -> str:
+        """Why the state cannot be saved; empty if it can."""
+        return "the disk does not answer" if self._thread.stuck > STATE_STUCK_S else self._error
 
     def restore(self, pipeline: Pipeline, make: Callable[[], Pipeline]) -> tuple[Pipeline, Mapping[str, Any] | None]:
         """Restore the newest copy that can be used into `pipeline`; return the pipeline to use, and the snapshot.
@@ -282,19 +275,14 @@ class StateKeeper:
 
     def close(self, seconds: float) -> bool:
         """Wait until all is saved; False if it cannot be, or if that takes longer than `seconds`."""
-        return self._thread.close(seconds) and not self._failed
+        return self._thread.close(seconds) and not self._error
 
     def _write(self, snapshot: Mapping[str, Any], saved_at: float, uptime: float) -> None:
         try:
             state.write(self.file, state.encode(snapshot, saved_at, uptime))
+            self._error = ""
         except (OSError, ValueError, TypeError) as error:
-            if not self._failed:
-                log.warning("cannot save the state: %s", error)
-            self._failed = True
-        else:
-            if self._failed:
-                log.info("the state is saved again")
-            self._failed = False
+            self._error = str(error)
 
 
 def foreign_text(pipeline: Pipeline) -> str:
