@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.constants import KELVIN, WH
 from gz_onboard.physics.effect import BASE_EFFECTS
-from gz_onboard.physics.functions import PiecewiseLinear, linear
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -50,7 +50,7 @@ class EfficiencyMotor:
     ) -> float:
         power = self.torque_constant * current * speed
         share = min(max(power, 0.0) / POWER, 1.0)
-        efficiency = linear(SHARES, EFFICIENCY, share)
+        efficiency = PiecewiseLinear(SHARES, EFFICIENCY).at(share)
         loss = power / efficiency - power if power >= 0 else power * efficiency - power
         ledger["motor"] += loss * dt
         return loss

@@ -41,7 +41,7 @@ class Filter:
         assert vehicle.battery
         self.battery = battery = vehicle.battery
         self.wheel_radius = vehicle.model.parameters["wheel_radius"]
-        self.soc_axis, self.ocv = np.array(battery.ocv_soc), np.array(battery.ocv_value)
+        self.soc_axis, self.ocv = np.array(battery.ocv_curve.x), np.array(battery.ocv_curve.y)
         self.tables = {
             name: (np.array(mesh.temperature), np.array(mesh.soc), np.array(mesh.value))
             for name, mesh in (("r0", battery.r0), ("r1", battery.r1), ("c1", battery.c1))

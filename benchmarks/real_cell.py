@@ -148,7 +148,8 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table), geometric=True)
 
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
-    ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
+    ocv = PiecewiseLinear(tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)))
+    ocv_table = ocv, float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
     battery = Battery(1, 1, capacity_25, PiecewiseLinear(temperature, share), 2.5, 0.0, *ocv_table, *circuit)
     error, time = (

@@ -41,9 +41,8 @@ from gz_onboard.estimator.pattern import Point
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.drawable import cells_ahead, drawable
 from gz_onboard.physics.model import Model
-from gz_onboard.physics.warming import cells_ahead
 
 
 @dataclass(frozen=True)

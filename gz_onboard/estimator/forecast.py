@@ -19,11 +19,9 @@ from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import AHEAD
 from gz_onboard.estimator.saved_fields import Each, Number
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.cooling import pack_constants
-from gz_onboard.physics.drawable import Drawable, drawable
+from gz_onboard.physics.drawable import Drawable, cells_ahead, drawable, pack_constants
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
-from gz_onboard.physics.warming import cells_ahead
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.physics.cooling import pack_constants
+from gz_onboard.physics.drawable import pack_constants
 from gz_onboard.physics.functions import decay_over, relaxed
 from gz_onboard.physics.parameters import Parameters
 
@@ -21,7 +21,7 @@ def at_rest(temperature: float) -> float:
 class Temperatures:
     """Remembers the cells' temperature, and how much warmer than the air their heat has made them.
 
-    A temperature that is not measured follows the pack's cooling network (`physics.cooling.pack_constants`), which is
+    A temperature that is not measured follows the pack's cooling network (`physics.drawable.pack_constants`), which is
     exact over any step.
     """
 

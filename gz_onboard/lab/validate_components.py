@@ -19,12 +19,13 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
+from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
+from gz_onboard.offline.sensors import road_speed
+from gz_onboard.offline.series import ocv_over, over, reversible_heat_over
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
-from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.physics.functions import relaxed
-from gz_onboard.physics.model import air_density, all_quantities, drag_torque, over, stepper, total
-from gz_onboard.physics.sensors import road_speed
+from gz_onboard.physics.model import air_density, all_quantities, drag_torque, stepper, total
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
 
@@ -186,9 +187,9 @@ def _temperatures(
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
-        rest = battery.ocv_over(levels, cells) * battery.cells_series
+        rest = ocv_over(battery, levels, cells) * battery.cells_series
         delivered = measured.get("pack_power", measured["pack_voltage"] * current)
-        generated = heat(rest, 0.0, current) - delivered + battery.reversible_heat(current, levels, cells)
+        generated = heat(rest, 0.0, current) - delivered + reversible_heat_over(battery, current, levels, cells)
         pack = LumpedCooling(p, "pack", start("cell_temperature"))
         add("cell_temperature", pack, generated)
     return found

@@ -8,6 +8,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_score import NAMES, PackEmpty
+from gz_onboard.offline.series import curve_over
 from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.run import Run, ran_empty
 from gz_onboard.vehicle import Vehicle
@@ -34,7 +35,7 @@ def _held_back(share: PiecewiseLinear, soc: Array) -> int:
 
     Of a ride that begins so, the last: its vehicle was held back as well.
     """
-    free = np.flatnonzero(share.over(soc) >= 1.0)
+    free = np.flatnonzero(curve_over(share, soc) >= 1.0)
     return min(int(free[-1]) + 1, len(soc) - 1) if len(free) else len(soc) - 1
 
 

@@ -15,14 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import sqrt
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear, Row, decay_over, extended, extended_over, relaxed
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, decay_over, relaxed
 
 T = TypeVar("T")
 Overpotential = Callable[[float, float, float, float], float]
@@ -31,7 +29,6 @@ Overpotential = Callable[[float, float, float, float], float]
 HALF_FULL = 0.5  # SOC that is taken where it is not known
 MOST_SOC_SD = 0.3  # a SOC of which nothing is known lies between 0 and 1: that is 0.29
 QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
-SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
 
 def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> Any:
@@ -65,15 +62,6 @@ def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
     not show in the voltage: the cell exchanges this heat with its surroundings.
     """
     return -entropy * current * (temperature + KELVIN)
-
-
-def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
-    """Heat [W] of a cell's resistors alone; current_squared: mean square of its current [A²].
-
-    It is `heat` without the energy that the RC pair's capacitor takes in and gives back; over a ride both have the same
-    sum. The mean square includes bursts faster than the steps.
-    """
-    return r0 * current_squared + v1 * v1 / r1
 
 
 @dataclass(frozen=True)
@@ -138,8 +126,7 @@ class Battery:
     capacity_share: PiecewiseLinear  # of the capacity at 25 degC, over degC
     cutoff_voltage: float  # V of a cell
     series_resistance: float  # ohm, of the pack beside its cells
-    ocv_soc: Row
-    ocv_value: Row  # V
+    ocv_curve: PiecewiseLinear  # V of a cell over SOC, both increasing
     ocv_sd: float  # V
     r0: Mesh  # ohm
     r1: Mesh  # ohm
@@ -156,6 +143,10 @@ class Battery:
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
     health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
 
+    @cached_property
+    def _soc_of_ocv(self) -> PiecewiseLinear:
+        return PiecewiseLinear(self.ocv_curve.y, self.ocv_curve.x)
+
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
         fresh = self.capacity * self.capacity_share.at(temperature)
@@ -166,7 +157,7 @@ class Battery:
         return self.cell_capacity(temperature) * self.cells_parallel
 
     def rest_shift(self, temperature: float) -> float:
-        """How much higher [V] a cell rests at `temperature` [degC] than `ocv_value` says."""
+        """How much higher [V] a cell rests at `temperature` [degC] than `ocv_curve` says."""
         return self.rest_shift_curve.at(temperature) if self.rest_shift_curve else 0.0
 
     def voltage_error(self, temperature: float, usual: float) -> float:
@@ -179,24 +170,16 @@ class Battery:
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
-        volts, slope = extended(self.ocv_soc, self.ocv_value, soc)
+        volts, slope = self.ocv_curve.extended(soc)
         if temperature is not None and self.rest_shift_curve:
-            volts += self.rest_shift(temperature)
+            volts += self.rest_shift_curve.at(temperature)
         return volts, slope
 
-    def ocv_over(self, soc: Array, temperature: Array) -> Array:
-        """`ocv` at `soc` and `temperature`, both (m,): values only."""
-        volts = extended_over(self.ocv_soc, self.ocv_value, soc)
-        if self.rest_shift_curve:
-            volts = volts + self.rest_shift_curve.over(temperature)
-        return volts
-
-    def reversible_heat(self, current: Any, soc: Any, temperature: Any) -> Any:
-        """`reversible_heat` of the pack [W] at its `current` [A] and `temperature` [degC]; all floats, or all (n,)."""
+    def reversible_heat(self, current: float, soc: float, temperature: float) -> float:
+        """`reversible_heat` of the pack [W] at its `current` [A] and `temperature` [degC]."""
         if self.entropy is None:
-            return 0.0 * current
-        entropy: Any = self.entropy.at(soc) if isinstance(soc, float) else self.entropy.over(soc)
-        return reversible_heat(self.cells_series * entropy, current, temperature)
+            return 0.0
+        return float(reversible_heat(self.cells_series * self.entropy.at(soc), current, temperature))
 
     def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:
         """Heat of the pack [W] at its `current` [A] and `temperature` [degC], with the reversible part.
@@ -213,17 +196,7 @@ class Battery:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
         if temperature is not None:
             ocv -= self.rest_shift(temperature)
-        return extended(self.ocv_value, self.ocv_soc, ocv)[0]
-
-    def soc_at_load(self, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:
-        """The SOC of a cell with this `voltage` [V] at a `current` [A] and `temperature` [degC]; v1 [V]: its RC pair's.
-
-        It may be below 0 or above 1, where the open-circuit voltage continues.
-        """
-        soc = HALF_FULL
-        for _ in range(SOC_ROUNDS):
-            soc = self.soc_at(voltage + self.r0.at(soc, temperature)[0] * current + v1, temperature)
-        return soc
+        return self._soc_of_ocv.extended(ocv)[0]
 
     def circuit(self, soc: float, temperature: float) -> tuple[float, float, float]:
         """(R0 [ohm], R1 [ohm], C1 [F]) of a cell at `temperature` [degC]."""

@@ -1,10 +1,10 @@
-"""Energy that a pack still delivers until its weakest cells reach the cut-off voltage."""
+"""Energy that a pack still delivers until its weakest cells reach the cut-off voltage, and how warm it is meanwhile."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import exp, sqrt
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential
@@ -25,6 +25,12 @@ DISCHARGE = DischargeConfig()
 # Gauss-Legendre nodes and weights on [0, 1], of order 4: within 0.2 % of the energy
 _NODES = (0.0694318442, 0.3300094782, 0.6699905218, 0.9305681558)
 _WEIGHTS = (0.1739274226, 0.3260725774, 0.3260725774, 0.1739274226)
+
+# Gauss-Legendre nodes of order 3 over the charge that is left, for the heat of the reaction
+_REACTION_NODES = 0.1127, 0.5, 0.8873
+_REACTION_WEIGHTS = 0.2778, 0.4444, 0.2778
+HOT_CELLS_C = 50.0  # degC: vehicles limit the power of hotter cells
+DIGITS = 1  # of the result [degC]: rows of tables at it are kept for seconds; 0.1 K is 0.05 % of the energy
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ def drawable(
     slope = charge * (power / now if now else cutoff * battery.cells_series)
     if over < 0 or soc <= least or now is None:
         return Drawable(0.0, slope, soc, *at_end(soc, over), end_sd)
-    end = _root(margin, (least, *(x for x in battery.ocv_soc if least < x < soc), soc), over)
+    end = _root(margin, (least, *(x for x in battery.ocv_curve.x if least < x < soc), soc), over)
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         now = mean_current(end + (soc - end) * node, now) or now
@@ -128,3 +134,50 @@ def soc_left(left: Drawable, soc: float, share: float) -> float:
     square = min(left.slope * width / left.energy, 2.0) - 1
     line = 1 - square
     return left.end + width * 2 * share / (line + sqrt(line * line + 4 * square * share))
+
+
+def pack_constants(p: Mapping[str, float]) -> tuple[float, float]:
+    """(conductance [W/K], time constant [s]) of a pack in the ambient air (eq. 2.30)."""
+    conductance = p["pack_conductance"] * p["cooling_factor"]
+    return conductance, p["pack_heat_capacity"] / conductance
+
+
+def cells_ahead(
+    battery: Battery,
+    cooling: tuple[float, float],
+    cells: tuple[float, float],
+    ambient: float,
+    load: tuple[float, float],
+    overpotential: Overpotential | None = None,
+) -> float:
+    """Mean temperature [degC] of the cells until they are empty, from (SOC, temperature [degC]) now.
+
+    Their loss at the mean power and the reversible heat of their reaction warm one mass that the air cools (eq. 2.30),
+    in closed form. Warm cells lose less: the mean is where the line through the solutions for two assumed temperatures
+    gives the temperature that it assumes.
+
+    cooling: see `pack_constants`; load: mean power [W] and the square of its form factor; ambient in degC;
+    overpotential: see `Battery.settled_current`.
+    """
+    (soc, temperature), (power, form_factor_squared), (conductance, time_constant) = cells, load, cooling
+    if power <= 0 or soc <= 0:
+        return temperature
+    nodes = zip(_REACTION_NODES, _REACTION_WEIGHTS, strict=True)
+    reaction: float = sum(weight * battery.reversible_heat(1.0, at * soc, temperature) for at, weight in nodes)  # W/A
+
+    def mean_if(assumed: float) -> float:
+        source = battery.cells_series * battery.ocv(soc / 2, assumed)[0]
+        current = battery.settled_current(power, soc / 2, assumed, form_factor_squared, overpotential)
+        if current is None:  # bursts are capped at the most that the pack gives, of which half stays in it as heat
+            current = 2 * power / source
+        settled = ambient + ((source + reaction) * current - power) / conductance
+        lasting = max(soc * battery.pack_capacity(assumed) * HOUR / current / time_constant, 1e-6)
+        return settled + (temperature - settled) * (1 - exp(-lasting)) / lasting
+
+    # Whole degrees, so that rows of tables at them are kept.
+    first = round(temperature)
+    found = mean_if(first)
+    second = round(found) if abs(found - first) > 1 else first + 1
+    slope = (mean_if(second) - found) / (second - first)
+    mean = found + slope * (found - first) / max(1 - slope, 0.5)
+    return round(min(mean, max(temperature, HOT_CELLS_C)), DIGITS)

@@ -10,11 +10,10 @@ from functools import cache, partial
 from typing import Any
 
 from gz_onboard.constants import KELVIN
-from gz_onboard.physics.battery import HALF_FULL, QUICK, Battery, Overpotential
+from gz_onboard.physics.battery import QUICK, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port
-from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxation, relaxed, sqrt
+from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxed, sqrt
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.sensors import road_speed
 
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 
@@ -57,20 +56,6 @@ class Bound:
         """Its value `dt` [s] after `state`."""
         return float(relaxed(state, self(quantities), self.decay(dt, quantities)))
 
-    def series(self, dt: Any, quantities: Mapping[str, Any], before: bool = False) -> Any:
-        """Its values (n,) at the ends of steps of `dt` [s], starting from 0.
-
-        quantities: in each step, scalars or arrays (n,); n = 1 if all are scalars. before: at the beginnings instead.
-        """
-        import numpy as np
-
-        target, decay = np.broadcast_arrays(
-            np.asarray(self(quantities), dtype=float), np.asarray(self.decay(dt, quantities), dtype=float), np.ones(1)
-        )[:2]
-        if self.effect.decay is None or not target.any():
-            return target.copy()
-        return relaxation(target, decay, before=before)
-
 
 def _call(function: str, names: Iterable[str]) -> str:
     """Source of a call of `function` with the quantities `names` out of a dictionary ``q``."""
@@ -110,11 +95,6 @@ def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str
 
 Recall = Callable[[Bound, Mapping[str, Any]], Any]
 """The value of an effect with memory at these quantities."""
-
-
-def over(dt: Any) -> Recall:
-    """For arrays over consecutive steps of `dt` [s], starting from 0: see `Bound.series`."""
-    return lambda effect, quantities: effect.series(dt, quantities)
 
 
 def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
@@ -160,7 +140,7 @@ class Model:
             self._at[effect.port].append(Bound(effect, parameters))
         self.reads: frozenset[str] = frozenset().union(*(effect.reads for effect in effects))
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
-        self._motor_per_speed = 1 / road_speed(1.0, parameters)
+        self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
 
     def at(self, *ports: Port) -> list[Bound]:
         """The effects at these ports."""
@@ -264,21 +244,3 @@ def standing_load(current: float, voltage: float, auxiliary_power: float) -> flo
     """
     most = STANDING_LOADS * auxiliary_power / voltage if voltage > 0 else 0.0
     return min(max(current, -most), most)
-
-
-def first_soc(
-    effects: Iterable[Bound], battery: Battery, first: tuple[float, float], temperature: float, load: float
-) -> float:
-    """The SOC from the pack's first voltage [V] and current [A] of a ride.
-
-    effects: in the cells. temperature: degC. load: the current [A] that has flowed for `STOOD`, from rest, see
-    `standing_load`; the RC pair, slower than most effects, is taken to be at rest still. The SOC may be below 0 or
-    above 1, see `Battery.soc_at_load`.
-    """
-    voltage, current = first
-    cell, capacity = current / battery.cells_parallel, battery.cell_capacity(temperature)
-    q = all_quantities(
-        cell_current=load / battery.cells_parallel, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity
-    )
-    lost = float(sum(effect(q) * (1 - effect.decay(STOOD, q)) for effect in effects))
-    return battery.soc_at_load(battery.cell_voltage(voltage, current) + lost, cell, temperature)

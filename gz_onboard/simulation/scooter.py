@@ -15,7 +15,7 @@ from math import sqrt
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
-from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
+from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.functions import direction
 from gz_onboard.physics.model import air_density, drag_torque, stepper

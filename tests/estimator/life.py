@@ -75,7 +75,7 @@ class Scooter:
 
     def _draw(self, power: float, charge: float) -> tuple[float, float]:
         resistance, pack = 0.066 * self.resistance, self.vehicle.pack
-        rest = float(np.interp(self.soc, pack.ocv_soc, pack.ocv_value))
+        rest = pack.ocv_curve.at(self.soc)
         source = pack.cells_series * (rest - self.fast - self.slow)
         current = (source - sqrt(max(source**2 - 4 * resistance * power, 0))) / (2 * resistance) - charge
         voltage = source - resistance * current

@@ -53,7 +53,7 @@ class Plant:
             speed = max(speed + a * dt, 0.0)
             way += speed * dt
             power = 60 + speed * (190 * a * 1.05 + 26 + 0.36 * speed**2) * (1.15 if a > -0.3 else 0.3)
-            ocv = np.interp(self.soc, BATTERY.ocv_soc, BATTERY.ocv_value)
+            ocv = BATTERY.ocv_curve.at(self.soc)
             source = 14 * (ocv - fast - slow)
             resistance = 0.066
             current = (source - np.sqrt(max(source**2 - 4 * resistance * power, 0))) / (2 * resistance)

@@ -13,11 +13,11 @@ from gz_onboard.estimator.consumption import ExpectedRiding
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.saved_fields import check
-from gz_onboard.physics.cooling import LumpedCooling, pack_constants
+from gz_onboard.offline.cooling import LumpedCooling
+from gz_onboard.physics.drawable import cells_ahead, pack_constants
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.warming import cells_ahead
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)

@@ -12,6 +12,7 @@ from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, HISTORY_TIME, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.events import ROLES, Reason
+from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
@@ -141,7 +142,7 @@ def test_the_first_voltage_is_waited_for():
 
 def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
     """6 mV that stay are worth 5 % of charge where the curve rises by 0.1 V over 80 %, however often they are seen."""
-    flat = replace(VEHICLE.pack, ocv_soc=(0.0, 0.1, 0.9, 1.0), ocv_value=(2.5, 3.2, 3.3, 3.6))
+    flat = replace(VEHICLE.pack, ocv_curve=PiecewiseLinear((0.0, 0.1, 0.9, 1.0), (2.5, 3.2, 3.3, 3.6)))
     uncertainty = VoltageUncertainty(flat, VEHICLE.parameters)
     assert not uncertainty.tells_more(0.5, 0.03**2)
     assert uncertainty.tells_more(0.5, 0.10**2)

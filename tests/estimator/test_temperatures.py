@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gz_onboard.events import Group
-from gz_onboard.physics.cooling import LumpedCooling
+from gz_onboard.offline.cooling import LumpedCooling
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import EventEstimator
 

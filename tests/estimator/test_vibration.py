@@ -17,8 +17,8 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW, Group, RoleWindow
+from gz_onboard.offline.sensors import Vibration
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.sensors import Vibration
 from gz_onboard.simulation.frames import batches, simulate_frames
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter

@@ -205,8 +205,8 @@ def fed(battery: Battery, missing: float, soc: tuple[float, float]) -> WeakestGr
 
 
 def test_a_flat_curve_shows_a_low_group_only_at_its_end():
-    flat = tuple(3.2 + 0.03 * z + (0.2 * (z - 0.1) / 0.1 if z < 0.1 else 0.0) for z in VEHICLE.pack.ocv_soc)
-    battery = replace(VEHICLE.pack, ocv_value=flat).own()
+    flat = tuple(3.2 + 0.03 * z + (0.2 * (z - 0.1) / 0.1 if z < 0.1 else 0.0) for z in VEHICLE.pack.ocv_curve.x)
+    battery = replace(VEHICLE.pack, ocv_curve=replace(VEHICLE.pack.ocv_curve, y=flat)).own()
     plateau = fed(battery, 0.04, (0.9, 0.3)).learned()["weak_charge"]
     assert plateau.sd > 0.9 * CONFIG.prior_sd[CHARGE]
     assert abs(plateau.value - 1) < 0.01

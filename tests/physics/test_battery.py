@@ -10,11 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
+from gz_onboard.lab.calibrate.cooling_run import dissipation
+from gz_onboard.offline.series import first_soc, reversible_heat_over, soc_at_load
+from gz_onboard.physics.battery import current_of, heat, terminal_voltage
 from gz_onboard.physics.drawable import DISCHARGE, drawable
 from gz_onboard.physics.effect import Port, load_effect
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear
-from gz_onboard.physics.model import Model, first_soc
+from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -35,7 +37,7 @@ def test_slopes_are_the_differences(soc, temperature):
     h = 1e-7
     for value, slope in ((BATTERY.ocv, None), (lambda s: BATTERY.r0.at(s, temperature), None)):
         del slope
-        if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_soc, *BATTERY.r0.soc)):
+        if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_curve.x, *BATTERY.r0.soc)):
             return
         difference = (value(soc + h)[0] - value(soc - h)[0]) / (2 * h)
         assert value(soc)[1] == pytest.approx(difference, rel=1e-3, abs=1e-5)
@@ -49,11 +51,11 @@ def test_soc_at_inverts_ocv(soc):
 @given(st.floats(0.1, 0.95), st.floats(-1, 4), st.floats(0, 40), st.floats(-0.02, 0.05))
 def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
     voltage = BATTERY.terminal_voltage(soc, v1, current, temperature)[0]
-    assert BATTERY.soc_at_load(voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
+    assert soc_at_load(BATTERY, voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
     voltage = BATTERY.terminal_voltage(soc, 0.0, current, temperature)[0]
     amperes = BATTERY.cells_parallel * current
     first = first_soc([], BATTERY, (BATTERY.pack_voltage(voltage, amperes), amperes), temperature, 0.0)
-    assert first == pytest.approx(BATTERY.soc_at_load(voltage, current, temperature), abs=1e-9)
+    assert first == pytest.approx(soc_at_load(BATTERY, voltage, current, temperature), abs=1e-9)
 
 
 def test_what_the_resistors_take_and_the_chemistry_gives_is_the_same_over_a_ride():
@@ -91,7 +93,7 @@ def test_a_cell_advances_by_charge_and_rc_pair(soc, v1, current, temperature, dt
 def test_terminal_voltage_and_its_slope(soc, current, temperature):
     voltage, slope = BATTERY.terminal_voltage(soc, 0.02, current, temperature)
     assert voltage == BATTERY.ocv(soc, temperature)[0] - BATTERY.r0.at(soc, temperature)[0] * current - 0.02
-    if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_soc, *BATTERY.r0.soc)):
+    if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_curve.x, *BATTERY.r0.soc)):
         return
     high, low = (BATTERY.terminal_voltage(soc + h, 0.02, current, temperature)[0] for h in (1e-7, -1e-7))
     assert slope == pytest.approx((high - low) / 2e-7, rel=1e-3, abs=1e-5)
@@ -273,7 +275,7 @@ def test_heat_of_the_reaction_turns_with_the_current_and_with_the_entropy():
     battery = replace(BATTERY, entropy=PiecewiseLinear((0.2, 0.8), (-4e-4, 2e-4)))
     assert battery.reversible_heat(10.0, 0.0, 25.0) == pytest.approx(battery.cells_series * 4e-4 * 10 * 298.15)
     assert battery.reversible_heat(-10.0, 0.6, 25.0) == pytest.approx(0.0, abs=1e-9)
-    many = battery.reversible_heat(np.array([10.0, -10.0]), np.array([0.9, 0.9]), np.array([0.0, 0.0]))
+    many = reversible_heat_over(battery, np.array([10.0, -10.0]), np.array([0.9, 0.9]), np.array([0.0, 0.0]))
     assert many == pytest.approx([-2e-3 * battery.cells_series * 273.15, 2e-3 * battery.cells_series * 273.15])
     none = replace(battery, entropy=None)
     assert none.reversible_heat(10.0, 0.5, 25.0) == 0

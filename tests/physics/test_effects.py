@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
+from gz_onboard.offline.series import over, series
 from gz_onboard.physics.effect import QUANTITIES, Port, effects_in, known_effects, load_effect
-from gz_onboard.physics.model import Bound, over, stepping
+from gz_onboard.physics.model import Bound, stepping
 from gz_onboard.physics.parameters import declared_parameters
 
 EFFECTS = [load_effect(name) for name in known_effects()]
@@ -156,7 +157,7 @@ def test_an_effect_with_memory_starts_at_nothing():
     e = bound(load_effect("slow_relaxation"))
     q = {"cell_current": 5.0}
     assert e.step(0.0, 0.0, q) == 0
-    assert e.series(0.1, q).shape == (1,)
+    assert series(e, 0.1, q).shape == (1,)
 
 
 def test_headwind_is_the_difference_of_the_drag_and_goes_round_with_the_heading():

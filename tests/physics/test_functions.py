@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.functions import decay_over, mean_response, relaxation, relaxed
+from gz_onboard.offline.series import relaxation
+from gz_onboard.physics.functions import decay_over, mean_response, relaxed
 
 steps = st.lists(st.tuples(st.floats(-5, 5), st.floats(0, 1)), min_size=1, max_size=30)
 

@@ -23,8 +23,9 @@ from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
+from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, mesh_over, ocv_over
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear, bilinear_over, extended, extended_over, linear
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import air_density, stepper
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.rider import Rider
@@ -149,8 +150,8 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
     capacity = np.array([PACK.cell_capacity(t) for t in temperatures])
     shift = np.array([PACK.rest_shift(t) for t in temperatures])
     cell = Circuit(
-        np.array(PACK.ocv_soc),
-        np.array(PACK.ocv_value),
+        np.array(PACK.ocv_curve.x),
+        np.array(PACK.ocv_curve.y),
         np.array(PACK.r0.soc),
         temperatures,
         capacity,
@@ -162,7 +163,7 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
         rest_shift=shift,
         reaction=Reaction(P["charge_transfer_resistance"], P["charge_transfer_activation"], P["charge_transfer_time"]),
     )
-    each = PACK.capacity * PACK.capacity_share.over(celsius)
+    each = PACK.capacity * curve_over(PACK.capacity_share, celsius)
     soc = SOC - np.cumsum(i * dt / (3600 * each))
     ends = voltage(cell, i, i, dt, soc, celsius)
     assert ends[::2] == pytest.approx(written_out(ride)[0], abs=0.2 * MILLIVOLT)
@@ -186,12 +187,12 @@ def test_the_simulation_draws_the_same_current_and_heat(ride):
 def test_validation_and_calibration_warm_the_cells_alike(ride):
     modelled = components(VEHICLE, ride, SOC, AMBIENT, None)["cell_temperature"].modelled
     count = SOC - np.cumsum(ride["pack_current"] / (3600 * PACK.pack_capacity(float(ride["cell_temperature"][0]))))
-    rest = PACK.cells_series * PACK.ocv_over(count, ride["cell_temperature"])
+    rest = PACK.cells_series * ocv_over(PACK, count, ride["cell_temperature"])
     series = PACK.cells_series * ride["pack_current"]
     lost = (rest - ride["pack_voltage"]) * ride["pack_current"]
     run = calibration_run(ride, pack_heat=lost, series_current=series, soc=count)
     assert PACK.entropy
-    disorder = dict(zip(ENTROPY, PACK.entropy.over(np.array(ENTROPY_SOC)), strict=True))
+    disorder = dict(zip(ENTROPY, curve_over(PACK.entropy, np.array(ENTROPY_SOC)), strict=True))
     exposed = dict(P) | {"pack_conductance": P["pack_conductance"] * P["cooling_factor"]} | disorder
     start = float(ride["cell_temperature"][0]) - pack_temperatures(exposed, run)["cell_temperature"][0]
     by_calibration = pack_temperatures(exposed | {"start:ride:cell_temperature": start}, run)["cell_temperature"]
@@ -345,18 +346,17 @@ def test_a_table_is_read_alike_one_value_or_many_at_a_time(data, xs, ys):
     points = data.draw(st.lists(st.tuples(st.floats(-2, 3), st.floats(-2, 3)), min_size=1, max_size=5))
     x, y = np.array(points).T
     mesh = Mesh(tuple(xs), tuple(ys), table)
-    assert mesh.over(x, y) == pytest.approx([mesh.at(*point)[0] for point in points], rel=1e-9, abs=1e-9)
-    assert bilinear_over(np.array(xs), np.array(ys), np.array(table), x, y) == pytest.approx(mesh.over(x, y))
+    assert mesh_over(mesh, x, y) == pytest.approx([mesh.at(*point)[0] for point in points], rel=1e-9, abs=1e-9)
+    assert bilinear_over(np.array(xs), np.array(ys), np.array(table), x, y) == pytest.approx(mesh_over(mesh, x, y))
     positive = tuple(tuple(np.exp(0.3 * v) for v in values) for values in table)
     falling = Mesh(tuple(xs), tuple(ys), positive, geometric=True)
-    assert falling.over(x, y) == pytest.approx([falling.at(*point)[0] for point in points], rel=1e-9)
-    assert extended_over(mesh.soc, table[0], x) == pytest.approx(
-        [extended(mesh.soc, table[0], a)[0] for a in x], rel=1e-9, abs=1e-9
-    )
-    assert np.interp(x, xs, table[0]) == pytest.approx([linear(mesh.soc, table[0], a) for a in x], rel=1e-9, abs=1e-9)
+    assert mesh_over(falling, x, y) == pytest.approx([falling.at(*point)[0] for point in points], rel=1e-9)
+    curve = PiecewiseLinear(mesh.soc, table[0])
+    assert extended_over(mesh.soc, table[0], x) == pytest.approx([curve.extended(a)[0] for a in x], rel=1e-9, abs=1e-9)
+    assert np.interp(x, xs, table[0]) == pytest.approx([curve.at(a) for a in x], rel=1e-9, abs=1e-9)
 
 
 def test_a_battery_that_rests_lower_in_the_cold_does_so_for_a_whole_ride():
     cold = replace(PACK, rest_shift_curve=PiecewiseLinear((-10.0, 25.0), (-0.03, 0.0)))
     soc, celsius = np.array([0.1, 0.5, 1.02]), np.array([-20.0, 5.0, 30.0])
-    assert cold.ocv_over(soc, celsius) == pytest.approx([cold.ocv(s, t)[0] for s, t in zip(soc, celsius, strict=True)])
+    assert ocv_over(cold, soc, celsius) == pytest.approx([cold.ocv(s, t)[0] for s, t in zip(soc, celsius, strict=True)])

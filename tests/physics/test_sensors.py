@@ -7,7 +7,8 @@ import pytest
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.physics.sensors import grade_shown, road_speed, speed_factors, speed_role, true_columns
+from gz_onboard.offline.sensors import road_speed, speed_role, true_columns
+from gz_onboard.physics.sensors import grade_shown, speed_factors
 
 P = {
     "pack_current_offset": 0.5,
@@ -49,5 +50,5 @@ def test_speed_is_the_motors_if_there_is_one():
     assert speed_role("ride", columns, P) == ("motor_speed", 0.25 * 0.2)
     del columns["motor_speed"]
     assert speed_role("ride", columns, P) == ("wheel_speed_rear", 0.25)
-    with pytest.raises(InputError, match="ride: has no speed: none of motor_speed, wheel"):
+    with pytest.raises(InputError, match="ride: has no speed; it needs one of motor_speed, wheel"):
         speed_role("ride", {}, P)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling
+from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.brakes import Brakes

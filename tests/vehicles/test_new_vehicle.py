@@ -234,4 +234,4 @@ def test_on_a_terminal_it_asks_for_what_is_missing(tmp_path):
     assert "lead: must be one of" in said
     assert "0.2x: is no number" in said
     vehicle = read_vehicle(tmp_path / "a.toml")
-    assert (vehicle.parameters["wheel_radius"], vehicle.pack.ocv_value) == (0.21, NCA.ocv)
+    assert (vehicle.parameters["wheel_radius"], vehicle.pack.ocv_curve.y) == (0.21, NCA.ocv)

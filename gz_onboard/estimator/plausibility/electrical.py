@@ -85,7 +85,7 @@ class PackSensors:
         self._voltage_sd = parameters.sd("pack_voltage_offset") / self._series
         self._usual_voltage = battery.ocv(HALF_FULL)[0] * self._series
         self._lowest = CONFIG.lowest_voltage_ratio * battery.cutoff_voltage
-        self._highest = CONFIG.highest_voltage_ratio * battery.ocv_value[-1]
+        self._highest = CONFIG.highest_voltage_ratio * battery.ocv_curve.y[-1]
         self.counters = {role: FaultCounter() for role in signals.mapped((*VOLTAGES, *CURRENTS))}
         self.sag = VoltageSag()
         time, skew = CONFIG.electrical_time_s, CONFIG.current_skew_s

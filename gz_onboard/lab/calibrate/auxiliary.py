@@ -13,7 +13,7 @@ from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.offline.arrays import held_at
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import speed_role
+from gz_onboard.offline.sensors import speed_role
 from gz_onboard.vehicle import Vehicle
 
 NEEDED = ("auxiliary_current", "pack_voltage")

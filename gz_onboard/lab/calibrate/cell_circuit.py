@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.offline.series import bilinear_over, extended_over, relaxation
 from gz_onboard.physics.battery import terminal_voltage
 from gz_onboard.physics.effects import charge_transfer
-from gz_onboard.physics.functions import bilinear_over, extended_over, relaxation, relaxed
+from gz_onboard.physics.functions import relaxed
 
 *FOUND, REACTIONS = charge_transfer.PARAMETERS
 """Those that pulses show, and the number of reactions. Pulses alone would take more of them, and road profiles held out

@@ -12,7 +12,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples, read_facts
-from gz_onboard.physics.sensors import speed_role, true_columns
+from gz_onboard.offline.sensors import speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s

@@ -12,8 +12,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
+from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 from gz_onboard.physics.battery import reversible_heat
-from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 
 Values = Mapping[str, float]
 Model = Callable[[Values, CoolingRun], dict[str, Array]]

@@ -6,6 +6,7 @@ On a bench the heat is measured; of a ride it is what the vehicle's own losses g
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,12 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.manifest import AIRFLOWS
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.arrays import held_integral
+from gz_onboard.offline.cooling import PERIOD
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.battery import dissipation
-from gz_onboard.physics.cooling import PERIOD
+from gz_onboard.offline.sensors import road_speed, true_columns
+from gz_onboard.offline.series import first_soc
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import STOOD, all_quantities, first_soc, stepping, total
-from gz_onboard.physics.sensors import road_speed, true_columns
+from gz_onboard.physics.model import STOOD, all_quantities, stepping, total
 from gz_onboard.vehicle import Vehicle
 
 FIRST = 1.0  # s: whose mean voltage and current tell the state of charge at the start, before the load has grown
@@ -170,6 +171,15 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
     if edges[-1] > time[-1]:
         result[-1] = value[-1]
     return result
+
+
+def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
+    """Heat [W] of a cell's resistors alone; current_squared: mean square of its current [A²].
+
+    It is `battery.heat` without the energy that the RC pair's capacitor takes in and gives back; over a ride both have
+    the same sum. The mean square includes bursts faster than the steps.
+    """
+    return r0 * current_squared + v1 * v1 / r1
 
 
 def _pack_heat(

@@ -31,7 +31,7 @@ from gz_onboard.lab.calibrate.pulse_error import slow_pair
 from gz_onboard.lab.calibrate.result import Curve, Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples, ride_name
-from gz_onboard.physics.sensors import true_columns
+from gz_onboard.offline.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 ABOVE_CUTOFF = 0.2  # V: at C/8 or slower a nearly empty cell is that near its open-circuit voltage
@@ -133,9 +133,9 @@ def _open_circuit(given: Given) -> tuple[Curve, Found]:
         if "battery.ocv" in result.curves and "cell_capacity" in result.parameters:
             return result.curves["battery.ocv"], result.parameters["cell_capacity"]
     battery, known = given.vehicle.pack, given.vehicle.parameters.known["cell_capacity"]
-    value = np.array(battery.ocv_value)
+    value = np.array(battery.ocv_curve.y)
     curve = Curve(
-        {"soc": np.array(battery.ocv_soc)}, value, np.full(len(value), battery.ocv_sd), "V", given.vehicle.file.name
+        {"soc": np.array(battery.ocv_curve.x)}, value, np.full(len(value), battery.ocv_sd), "V", given.vehicle.file.name
     )
     return curve, Found(known.value, known.sd, known.unit, known.source)
 

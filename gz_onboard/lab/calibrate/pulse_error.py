@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
-from gz_onboard.physics.functions import relaxation
+from gz_onboard.offline.series import relaxation
 
 GRID = 10.0  # s: between the values whose square and correlation are taken
 EMPTY = 0.1  # SOC up to which `cell_voltage_error_empty` counts

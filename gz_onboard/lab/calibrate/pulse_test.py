@@ -15,7 +15,7 @@ from gz_onboard.lab.calibrate.cell_fit import LEAST, Pieces, filtered, fit_branc
 from gz_onboard.lab.calibrate.ocv import FLAT
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.functions import extended_over
+from gz_onboard.offline.series import extended_over
 
 FEWEST_PULSES = 6
 FEWEST_LEVELS = 3

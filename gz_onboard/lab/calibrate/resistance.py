@@ -19,11 +19,12 @@ from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.samples import Samples
+from gz_onboard.offline.sensors import true_columns
+from gz_onboard.offline.series import first_soc
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.functions import decay_over
-from gz_onboard.physics.model import first_soc, standing_load
-from gz_onboard.physics.sensors import true_columns
+from gz_onboard.physics.model import standing_load
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s

@@ -13,7 +13,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.result import Fit, Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import true_columns
+from gz_onboard.offline.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 SLOWEST = 5.0  # m/s: below, a receiver's speed is poor

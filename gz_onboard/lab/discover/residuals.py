@@ -18,12 +18,13 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
 from gz_onboard.offline.arrays import block_means, running_mean
+from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
+from gz_onboard.offline.series import curve_over, first_soc, mesh_over, ocv_over, relaxation, reversible_heat_over
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
-from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.functions import decay_over, relaxation, relaxed
-from gz_onboard.physics.model import drag_torque, first_soc, standing_load
+from gz_onboard.physics.functions import decay_over, relaxed
+from gz_onboard.physics.model import drag_torque, standing_load
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
@@ -187,16 +188,16 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
     temperature = block_means(ride.quantities["cell_temperature"], SLOW)
     cold = colder(temperature)
-    capacity = p["cell_capacity"] * battery.capacity_share.over(temperature)
+    capacity = p["cell_capacity"] * curve_over(battery.capacity_share, temperature)
     taken = discharged(cell, DT, capacity)
     soc = p["soc_start"] + start_soc(ride, system) - (np.cumsum(taken) - taken / 2)  # at the middle of each step
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
     bent = p["resistance_current"] + p["resistance_current_cold"] * cold
     empty = p["resistance_empty"] + p["resistance_empty_cold"] * cold
     factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) * system.sizes.resistance / BENT)
-    r0 = battery.r0.over(soc, temperature) * factor
-    r1 = battery.r1.over(soc, temperature)
-    decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
+    r0 = mesh_over(battery.r0, soc, temperature) * factor
+    r1 = mesh_over(battery.r1, soc, temperature)
+    decay = np.exp(-DT / (r1 * mesh_over(battery.c1, soc, temperature) * np.exp(p["pair_time"])))
     settled = r1 * (1 + p["pair_resistance"]) * factor * cell
     v1 = relaxation(settled, decay, p["v1_start"], before=True)
     v1 = (v1 + relaxed(v1, settled, decay)) / 2  # the mean of the step's ends
@@ -206,7 +207,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     q = {name: block_means(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
-    rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
+    rest = ocv_over(battery, soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
     return CellCircuit(terminal_voltage(rest, r0, cell, v1 + extra), rest, cell * battery.cells_parallel, soc)
 
 
@@ -242,7 +243,7 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
     if late:
         amperes = np.interp(ride.time - late, ride.time, amperes)
     soc = np.full(len(ride.time), start_soc(ride, system))
-    r0 = battery.r0.over(soc, ride.quantities["cell_temperature"])
+    r0 = mesh_over(battery.r0, soc, ride.quantities["cell_temperature"])
     resistance = r0 * p.get("cell_resistance_factor", 1.0) / battery.cells_parallel
     resistance = resistance + p["pack_series_resistance"] / battery.cells_series
     fast = p["fast_resistance"] + p["fast_cold"] * colder(ride.quantities["cell_temperature"])
@@ -328,6 +329,6 @@ def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     cell = cell_circuit(ride, p, system)
     celsius = block_means(ride.quantities["cell_temperature"], SLOW)
     watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
-    watts = watts + system.pack.reversible_heat(cell.current, cell.soc, celsius)
+    watts = watts + reversible_heat_over(system.pack, cell.current, cell.soc, celsius)
     network = LumpedCooling(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
     return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, watts)

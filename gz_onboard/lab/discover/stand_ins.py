@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import road_speed, speed_role
+from gz_onboard.offline.sensors import road_speed, speed_role
 from gz_onboard.vehicle import Vehicle
 
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}

@@ -10,6 +10,7 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
+from gz_onboard.offline.series import series
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
 from gz_onboard.physics.model import Bound, value_of
@@ -44,7 +45,7 @@ class System:
         steps = np.full(len(next(iter(q.values()))), dt)
 
         def recall(effect: Bound, quantities: Mapping[str, Any]) -> Any:
-            return (effect.series(steps, quantities, before=True) + effect.series(steps, quantities)) / 2
+            return (series(effect, steps, quantities, before=True) + series(effect, steps, quantities)) / 2
 
         found = []
         for effect in self.effects:

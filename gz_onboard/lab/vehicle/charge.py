@@ -15,6 +15,7 @@ from gz_onboard.lab.estimate_summary import SHOWN_SD, gains
 from gz_onboard.lab.vehicle.electric import BY_VOLTAGE, SAGS, PackRide
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, relation, unit_of
+from gz_onboard.offline.series import soc_at_load
 from gz_onboard.vehicle import Vehicle
 
 RIGHT_SD, WRONG_SD = 2.0, 3.0  # between gauge and voltage: 95 and 99.7 % of what is right lies within
@@ -84,7 +85,7 @@ def _by_voltage(of: PackRide, point: RestPoint) -> tuple[str, float, float]:
     """(what gauge and voltage say, how far apart [sd], sd of the state of charge by the voltage)."""
     battery, load = of.battery, point.current / of.battery.cells_parallel
     cell = battery.cell_voltage(point.voltage, point.current)
-    soc = min(max(battery.soc_at_load(cell, load, of.temperature), 0.0), 1.0)
+    soc = min(max(soc_at_load(battery, cell, load, of.temperature), 0.0), 1.0)
     drop = battery.circuit(soc, of.temperature)[0] * load
     lost = max(abs(drop), point.left / battery.cells_series)
     sd = hypot(battery.ocv_sd, lost) / max(battery.ocv(soc, of.temperature)[1], FLATTEST)

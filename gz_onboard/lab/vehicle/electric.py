@@ -59,9 +59,9 @@ def drawn(ride: Seconds, vehicle: Vehicle) -> PackRide | None:
 def check_voltages(ride: Seconds, battery: Battery, current: Array | None) -> Iterator[Finding]:
     """Each within what the cells can have, and both against each other; current: of the pack [A] (n,)."""
     series = battery.cells_series
-    low = EMPTIEST * min(battery.cutoff_voltage, battery.ocv_value[0])
-    high = CONFIG.highest_voltage_ratio * battery.ocv_value[-1]
-    full, empty = battery.ocv_value[-1], battery.cutoff_voltage
+    low = EMPTIEST * min(battery.cutoff_voltage, battery.ocv_curve.y[0])
+    high = CONFIG.highest_voltage_ratio * battery.ocv_curve.y[-1]
+    full, empty = battery.ocv_curve.y[-1], battery.cutoff_voltage
     inside: list[str] = []
     for role in ride.any_of("pack_voltage", "inverter_voltage"):
         least, middle, most = (float(x) / series for x in np.nanpercentile(ride[role], (1, 50, 99)))

@@ -21,8 +21,9 @@ from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.validate_components import losses
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
+from gz_onboard.offline.sensors import road_speed, true_columns
+from gz_onboard.offline.series import curve_over
 from gz_onboard.physics.model import drag_torque
-from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.recording.logs import log_suffix
 from gz_onboard.vehicle import Vehicle
 
@@ -116,7 +117,7 @@ def efficiency_maps(
     drag = drag_torque(idle, speed)
     limits = p["torque_constant"] * p["motor_current_limit"], p["regeneration_torque_limit"]
     curves = derating.current_by_motor_speed, derating.regeneration_by_motor_speed
-    driving, braking = (limit * curve.over(speed) for limit, curve in zip(limits, curves, strict=True))
+    driving, braking = (limit * curve_over(curve, speed) for limit, curve in zip(limits, curves, strict=True))
     most, least = driving - drag, -braking - drag
     torque = np.linspace(min(float(least.min()), 0.0), float(most.max()), GRID)
     x, y = np.meshgrid(speed, torque)

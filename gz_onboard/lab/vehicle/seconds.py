@@ -14,7 +14,7 @@ from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.discover.grid import averaged, measured
 from gz_onboard.lab.discover.stand_ins import delays
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import true_columns
+from gz_onboard.offline.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each

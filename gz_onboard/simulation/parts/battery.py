@@ -8,7 +8,7 @@ from typing import Protocol
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
-from gz_onboard.physics.functions import decay_over, extended, relaxed
+from gz_onboard.physics.functions import decay_over, relaxed
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
@@ -78,7 +78,7 @@ class FirstOrderPack:
         self._age += dt
         battery = self.battery
         n, m = battery.cells_series, battery.cells_parallel
-        ocv, slope = extended(battery.ocv_soc, battery.ocv_value, self.soc)
+        ocv, slope = battery.ocv_curve.extended(self.soc)
         ocv += self._shift
         resistance = n * self._r0 / m + battery.series_resistance
         relaxing = n * (self.v1 + sum(self.effect_voltages))
@@ -111,7 +111,7 @@ class FirstOrderPack:
         ocv = self.battery.ocv
         sign = 1.0 if high >= low else -1.0
         a, b = (low, high) if high >= low else (high, low)
-        knots = [a, *(x for x in self.battery.ocv_soc[1:-1] if a < x < b), b]
+        knots = [a, *(x for x in self.battery.ocv_curve.x[1:-1] if a < x < b), b]
         total = sum((y - x) * (ocv(x)[0] + ocv(y)[0]) / 2 for x, y in pairwise(knots))
         total += (b - a) * self._shift
         return sign * total * self.battery.cells_series * HOUR * self._capacity

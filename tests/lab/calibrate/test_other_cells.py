@@ -56,7 +56,7 @@ def test_a_flat_curve_still_increases_when_rounded(tmp_path, knee):
     rest = len(table) - 1 - int(np.argmax(table["current"][::-1] > 0)) + 1
     table["voltage"][rest : rest + 61] += knee  # the cell rests far above the lowest voltages of its discharge
     result = ocv.calibrate(table)
-    assert np.all(np.diff(written(tmp_path, result).pack.ocv_value) >= 1e-5)
+    assert np.all(np.diff(written(tmp_path, result).pack.ocv_curve.y) >= 1e-5)
     notes = " ".join(result.notes)
     assert "(585 mΩ within minutes) would make 146" in notes
     assert "all of the gap counts as hysteresis" in notes

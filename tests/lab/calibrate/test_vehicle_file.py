@@ -81,7 +81,7 @@ def test_what_is_written_is_read_again(tmp_path_factory, result):
     curve = result.curves["battery.r0"]
     assert np.allclose(after.battery.r0.value, curve.value, rtol=1e-5)
     assert after.battery.r1.value == before.battery.r1.value
-    assert after.battery.ocv_value == before.battery.ocv_value
+    assert after.battery.ocv_curve == before.battery.ocv_curve
     assert (after.riding, after.name) == (before.riding, before.name)
     assert after.mapping.sources == before.mapping.sources
     # once more changes nothing

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, KNOTS, curve_forms
 from gz_onboard.lab.discover.grid import LONGEST, since, suspension_speed, vibration
-from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, Vibration
+from gz_onboard.offline.sensors import Vibration
+from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S
 
 RATE = 100.0
 

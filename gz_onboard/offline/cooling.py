@@ -94,12 +94,6 @@ class LumpedCooling:
 Network = InverterCooling | MotorCooling | LumpedCooling
 
 
-def pack_constants(p: Mapping[str, float]) -> tuple[float, float]:
-    """(conductance [W/K], time constant [s]) of a pack in the ambient air (eq. 2.30)."""
-    conductance = p["pack_conductance"] * p["cooling_factor"]
-    return conductance, p["pack_heat_capacity"] / conductance
-
-
 def temperatures(network: Network, dt: float, *columns: Array) -> list[float]:
     """Temperature of the node that has the sensor [degC], at the beginnings of steps of `dt` [s].
 
