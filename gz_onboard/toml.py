@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import re
 import tomllib
-from collections import Counter
 from collections.abc import Collection, Mapping
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ LARGEST_FILE = 1_000_000  # bytes; that of the reference scooter has 20 000
 LONGEST_LIST = 1000
 LONGEST_PATH = 200  # letters, of up to four bytes: no file system takes much more
 FEW = 30  # names that a message lists
+SMALLEST_STEP = 1e-6  # of an axis: a slope over it must stay a number
 
 _HEADER = re.compile(r"[ \t]*(\[\[?)[ \t]*([A-Za-z_\"'][^\[\],]*)\]+[ \t]*(?:#.*)?$")
 _KEY = re.compile(r"[ \t]*([\w\"'-][\w\"'. \t-]{0,200})=")
@@ -24,20 +24,16 @@ _KEY = re.compile(r"[ \t]*([\w\"'-][\w\"'. \t-]{0,200})=")
 _DEEP_KEY = re.compile(r"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){20}")  # from the beginning of a word only
 
 
-SMALLEST_STEP = 1e-6
-
-
 class Table:
     """A TOML table that knows its place in the file, for error messages.
 
-    lines: line numbers by path; path: that of this table, with an index for one of an array of tables.
+    text: of the whole file; path: of this table, with an index for one of an array of tables.
     """
 
-    def __init__(self, values: Mapping[str, Any], file: Path, lines: Mapping[str, int], path: str = "") -> None:
+    def __init__(self, values: Mapping[str, Any], file: Path, text: str, path: tuple[str, ...] = ()) -> None:
         self.values = values
         self.file = file
-        self.name = ".".join(part for part in path.split(".") if not part.isdigit())
-        self._lines = lines
+        self._text = text
         self._path = path
 
     @classmethod
@@ -48,7 +44,7 @@ class Table:
             line = text.count("\n", 0, deep.start()) + 1
             raise InputError(f"{file}:{line}: {shown(deep[0])}: this key has too many parts")
         try:
-            return cls(tomllib.loads(text), file, _line_numbers(text))
+            return cls(tomllib.loads(text), file, text)
         except ValueError as error:  # not TOML, or a number of thousands of digits
             raise InputError(f"{file}: not valid TOML: {error}") from error
         except RecursionError as error:
@@ -56,16 +52,17 @@ class Table:
 
     def error(self, message: str, key: str = "") -> InputError:
         """Return the error to raise about `key`, or about the table as a whole."""
-        path = _joined(self._path, key)
-        while path and path not in self._lines:  # a key that is missing, or in an inline table
-            path = path.rpartition(".")[0]
-        place = f"{self.file}:{self._lines[path]}" if path else str(self.file)
-        inside = ".".join(part[:LONGEST_NAME] for part in (self.name, key) if part)
+        path = (*self._path, key) if key else self._path
+        line = _line_of(self._text, path)
+        place = f"{self.file}:{line}" if line else str(self.file)
+        inside = ".".join(part[:LONGEST_NAME] for part in path if not part.isdigit())
         return InputError(f"{place}: {inside}: {message}" if inside else f"{place}: {message}")
 
-    def only(self, known: Collection[str]) -> None:
-        """InputError for a key that is not in `known`."""
+    def only(self, known: Collection[str], removed: Mapping[str, str] | None = None) -> None:
+        """InputError for a key that is not in `known`. removed: reasons for keys of earlier versions."""
         for key in self.values:
+            if removed and key in removed:
+                raise self.error(f"was removed: {removed[key]}", key)
             if key not in known:
                 there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
                 raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
@@ -77,7 +74,7 @@ class Table:
             value = {short: value}
         if not isinstance(value, Mapping):
             raise self.error(f"must be a table, is {shown(value)}", key)
-        return Table(value, self.file, self._lines, _joined(self._path, key))
+        return Table(value, self.file, self._text, (*self._path, key))
 
     def tables(self, key: str, most: int) -> list[Table]:
         """Return the tables of the array ``[[key]]``, at most `most`; none if it is missing."""
@@ -86,8 +83,7 @@ class Table:
             raise self.error(f"must be tables under headers [[{key}]], is {shown(value)}", key)
         if len(value) > most:
             raise self.error(f"there are {len(value)}, the most are {most}", key)
-        path = _joined(self._path, key)
-        return [Table(one, self.file, self._lines, f"{path}.{i}") for i, one in enumerate(value)]
+        return [Table(one, self.file, self._text, (*self._path, key, str(i))) for i, one in enumerate(value)]
 
     def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
         """Return the string `key`, one of `choices` if any are given."""
@@ -132,10 +128,7 @@ class Table:
         return tuple(self._number_of(number, key, low, high) for number in numbers)
 
     def increasing(self, key: str, low: float, high: float, unit: str = "") -> tuple[float, ...]:
-        """The list of increasing numbers `key` in `unit`, each within [low, high].
-
-        Steps are `SMALLEST_STEP` or more: a slope over them must stay a number.
-        """
+        """Return the list of numbers `key` in `unit`, each within [low, high], which increase by `SMALLEST_STEP`."""
         row, of = self.numbers(key), f" {unit}" if unit else ""
         for x in row:
             if not low <= x <= high:
@@ -170,35 +163,36 @@ class Table:
         return float(value)
 
 
-def _joined(path: str, key: str) -> str:
-    return ".".join(filter(None, (path, key)))
-
-
-def _line_numbers(text: str) -> dict[str, int]:
-    """Find the line of each table and key, by path; tables of an array are numbered from 0."""
-    lines: dict[str, int] = {}
-    table, counts = "", Counter[str]()
+def _line_of(text: str, path: tuple[str, ...]) -> int | None:
+    """The line of the first header or key that has most of `path` in its own; None if none begins alike."""
+    found, most = None, 0
+    table: tuple[str, ...] = ()
+    counts: dict[tuple[str, ...], int] = {}  # of the tables of an array so far
     for number, line in enumerate(text.split("\n"), start=1):
         if header := _HEADER.match(line):
-            table = path = _path(header[2])
+            table = here = _parts(header[2], counts)
             if header[1] == "[[":
-                lines.setdefault(path, number)
-                table = path = f"{path}.{counts[path]}"
-                counts[path.rpartition(".")[0]] += 1
-            elif array := next((array for array in counts if path.startswith(f"{array}.")), None):
-                table = path = f"{array}.{counts[array] - 1}{path[len(array) :]}"  # of the last table so far
+                name = here[:-1] if here[-1].isdigit() else here
+                counts[name] = counts.get(name, -1) + 1
+                table = here = (*name, str(counts[name]))
         elif key := _KEY.match(line):
-            path = _joined(table, _path(key[1]))
+            here = table + _parts(key[1], {})
         else:
             continue
-        while path:  # [a.b] also makes the table a
-            lines.setdefault(path, number)
-            path = path.rpartition(".")[0]
-    return lines
+        alike = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(here, path, strict=False)))
+        if alike > most:
+            found, most = number, alike
+    return found
 
 
-def _path(key: str) -> str:
-    return ".".join(part.strip(" \t\"'") for part in key.split("."))
+def _parts(key: str, counts: Mapping[tuple[str, ...], int]) -> tuple[str, ...]:
+    """The parts of a dotted key, with the index of the last table so far after the name of an array of tables."""
+    path: tuple[str, ...] = ()
+    for part in key.split("."):
+        path = (*path, part.strip(" \t\"'"))
+        if path in counts:
+            path = (*path, str(counts[path]))
+    return path
 
 
 def is_file(path: Path) -> bool:

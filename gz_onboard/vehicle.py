@@ -13,12 +13,11 @@ from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, RANGE_DBC, Publisher
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import MOST_EXTENDED, MOST_STANDARD
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.battery_file import read_battery
-from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect, read_effects
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
+from gz_onboard.physics.tables import Derating, read_battery, read_derating
 from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"

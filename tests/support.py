@@ -16,7 +16,8 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
-from gz_onboard.physics.effect import Port
+from gz_onboard.physics.effect import Effect, Port
+from gz_onboard.physics.parameters import Parameters, Value
 from gz_onboard.pipeline import TICK_NS, Pipeline
 from gz_onboard.recording.export import write_frames_as
 from gz_onboard.recording.frames import FrameColumns
@@ -35,6 +36,13 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def joined(parameters: Parameters, effects: Iterable[Effect]) -> Parameters:
+    """The `parameters` with those of `effects` that are not among them, at their priors."""
+    new = {p.name: p for effect in effects for p in effect.parameters if p.name not in parameters}
+    values = {name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for name, p in new.items()}
+    return Parameters(parameters.known | values, parameters.correlations, parameters.declared | new)
 
 
 def write_log(file: Path, frames: Sequence[Frame]) -> Path:

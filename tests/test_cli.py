@@ -163,7 +163,7 @@ def test_the_daemon_runs_no_effects_but_roots(
     file = with_effect(tmp_path)
     monkeypatch.setattr("gz_onboard.daemon.command.ROOT", 12345)  # root may run the tests, and the file be root's
     arguments = ["run", "--interface", "none", "--vehicle", str(file)]
-    assert "horn.py beside the file is code, and not run" in refused(capsys, *arguments)
+    assert "horn.py next to the file is code, and not run" in refused(capsys, *arguments)
     assert not list(tmp_path.rglob("*.ran"))
     assert "--interface none" in refused(capsys, *arguments, "--effects", str(file.parent / "effects"))
     assert list(tmp_path.rglob("*.ran"))

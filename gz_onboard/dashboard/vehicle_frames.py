@@ -19,8 +19,8 @@ from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, STEP_LIMITS, SelfReported
 from gz_onboard.events import STALE_PERIODS, Frame
-from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.sensors import speed_factors
+from gz_onboard.physics.tables import Derating
 from gz_onboard.vehicle import Vehicle
 
 LATE_PERIODS = 3  # of a message, after which its values are shown in grey; after STALE_PERIODS they are not shown

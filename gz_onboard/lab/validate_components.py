@@ -21,11 +21,11 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
 from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.offline.sensors import road_speed
-from gz_onboard.offline.series import ocv_over, over, reversible_heat_over
+from gz_onboard.offline.series import all_quantities, ocv_over, over, reversible_heat_over, stepper, total
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.physics.functions import relaxed
-from gz_onboard.physics.model import air_density, all_quantities, drag_torque, stepper, total
+from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
 

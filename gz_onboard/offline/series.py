@@ -5,7 +5,7 @@ Lags, tables and effects give here the values (n,) that their scalar forms in ``
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,18 @@ from numpy.typing import ArrayLike
 
 from gz_onboard.arrays import Array
 from gz_onboard.physics.battery import HALF_FULL, Battery, reversible_heat
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear
-from gz_onboard.physics.model import STOOD, Bound, Recall, all_quantities
+from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, sqrt
+from gz_onboard.physics.model import STOOD, Bound, Recall
 
 NEGLIGIBLE = 1e-20  # share of a value that is too small to change it in floating point
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
+
+
+def all_quantities(**known: Any) -> dict[str, Any]:
+    """All quantities that effects read, floats or arrays: `known`, the cosine of its ``grade``, and 0 for the rest."""
+    cosine = sqrt(1 - known["grade"] * known["grade"]) if "grade" in known else 1.0
+    return dict.fromkeys(QUANTITIES, 0.0) | {"grade_cosine": cosine} | known
 
 
 def relaxation(targets: Array, decays: Array, start: float = 0.0, before: bool = False) -> Array:
@@ -98,6 +105,41 @@ def series(effect: Bound, dt: Any, quantities: Mapping[str, Any], before: bool =
 def over(dt: Any) -> Recall:
     """Recall effects with memory over consecutive steps of `dt` [s], starting from 0: see `series`."""
     return lambda effect, quantities: series(effect, dt, quantities)
+
+
+def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, Any]], tuple[Any, ...]]:
+    """A function from quantities to the values of `effects`, to be called once each step of `dt` [s].
+
+    Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
+    loops and layers of calls: a simulation calls it a hundred times for each second ridden.
+    """
+    scope: dict[str, Any] = {"dt": dt}
+    lines = []
+    for i, bound in enumerate(effects):
+        term, decay = bound.effect.term, bound.effect.decay
+        call = term.source(f"term{i}")
+        scope |= term.scope(f"term{i}", bound.values)
+        if decay and dt is not None:
+            scope |= {f"value{i}": 0.0} | decay.scope(f"decay{i}", bound.values)
+            kept = decay.source(f"decay{i}")
+            if bound.has_fixed_time:
+                scope[f"kept{i}"], kept = bound.decay(dt, {}), f"kept{i}"
+            lines += [f"global value{i}", f"k = {kept}"]
+            call = f"k * value{i} + (1 - k) * {call}"
+        lines.append(f"value{i} = {call}")
+    values = "".join(f"value{i}, " for i in range(len(effects)))
+    exec("\n    ".join(["def values(q):", *lines, f"return ({values})"]), scope)
+    return scope["values"]  # type: ignore[no-any-return]
+
+
+def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
+    """The value of `effect`; with memory, as `recall` gives it, or settled without `recall`."""
+    return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
+
+
+def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
+    """The sum of the values of `effects`: see `value_of`."""
+    return sum((value_of(effect, quantities, recall) for effect in effects), 0.0)
 
 
 def soc_at_load(battery: Battery, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:

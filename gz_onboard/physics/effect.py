@@ -33,17 +33,16 @@ Sign conventions
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import inspect
 import os
 import stat
 import sys
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.errors import InputError, nearest, shown
@@ -185,7 +184,7 @@ class Equation:
     """A function of an effect's file, with the names of its arguments."""
 
     function: Callable[..., Any]
-    quantities: tuple[str, ...]  # positional, in order
+    quantities: tuple[str, ...]  # positional, in order; of a decay ``dt`` is the first
     parameters: tuple[str, ...]  # by keyword
 
     @classmethod
@@ -199,19 +198,27 @@ class Equation:
         """The value."""
         return self.function(*quantities, **parameters)
 
-    def at(self, quantities: Mapping[str, Any], parameters: Mapping[str, float]) -> Any:
-        """The value, with arguments by name."""
-        return self.with_parameters(parameters)(*[quantities[name] for name in self.quantities])
+    def source(self, label: str) -> str:
+        """Python source of a call with quantities from a dictionary ``q``, ``dt`` and the names of `scope`."""
+        quantities = [name if name == "dt" else f"q[{name!r}]" for name in self.quantities]
+        return f"{label}({', '.join([*quantities, *(f'{name}={label}_{name}' for name in self.parameters)])})"
 
-    def with_parameters(self, parameters: Mapping[str, float]) -> Callable[..., Any]:
-        """A function of the quantities alone."""
-        values, f = {name: parameters[name] for name in self.parameters}, self.function
-        if not isinstance(f, FunctionType):
-            return partial(f, **values)
-        # A simulation calls it a hundred times a second: defaults of a copy take half the time of a `partial`.
-        copy = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
-        copy.__kwdefaults__ = values
-        return copy
+    def scope(self, label: str, values: Mapping[str, float]) -> dict[str, Any]:
+        """The function and the `values` of its parameters under names that begin with `label`, for `source`."""
+        return {label: self.function} | {f"{label}_{name}": values[name] for name in self.parameters}
+
+    def bound(self, values: Mapping[str, float]) -> Callable[..., Any]:
+        """The equation with these `values` of its parameters, as a function of quantities by name, and of ``dt`` [s].
+
+        It is written out as source: loops over names would take several times as long, and it runs in each step.
+        """
+        return _binder(self)(*self.scope("call", values).values())
+
+
+@cache
+def _binder(equation: Equation) -> Callable[..., Callable[..., Any]]:
+    names = equation.scope("call", dict.fromkeys(equation.parameters, 0.0))
+    return eval(f"lambda {', '.join(names)}: lambda q, dt=0.0: {equation.source('call')}")  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -223,7 +230,7 @@ class Effect:
     parameters: tuple[Parameter, ...]
     term: Equation
     doc: str
-    decay: Equation | None = None  # its quantities are those after ``dt``
+    decay: Equation | None = None
     variation: Equation | None = None
     shown_by: str = ""
     stores_energy: bool = False
@@ -235,7 +242,7 @@ class Effect:
     @property
     def reads(self) -> frozenset[str]:
         """The quantities that term and decay need."""
-        return frozenset((*self.term.quantities, *(self.decay.quantities if self.decay else ())))
+        return frozenset((*self.term.quantities, *(self.decay.quantities[1:] if self.decay else ())))
 
     @property
     def takes(self) -> frozenset[str]:
@@ -255,12 +262,6 @@ class Effect:
 # --- finding and loading ------------------------------------------------------------------------------------------
 
 
-@cache
-def known_effects() -> tuple[str, ...]:
-    """The names of the package's effects."""
-    return effects_in(PACKAGE_EFFECTS)
-
-
 def effects_in(folder: Path) -> tuple[str, ...]:
     """The names of the effects in `folder`; files that begin with _ do not count. InputError if it does not exist."""
     if not folder.is_dir():
@@ -268,15 +269,27 @@ def effects_in(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(file.stem for file in folder.glob("*.py") if not file.stem.startswith("_")))
 
 
-def effect_file(name: str, folder: Path) -> Path | None:
+@cache
+def known_effects() -> tuple[str, ...]:
+    """The names of the package's effects."""
+    return effects_in(PACKAGE_EFFECTS)
+
+
+@cache
+def package_effects() -> dict[str, ModuleType]:
+    """The modules of the package's effects, by name."""
+    return {name: importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects()}
+
+
+def effect_file(name: str, folder: Path | None) -> Path | None:
     """The file of the effect `name` in `folder` itself; None if there is none."""
-    file = folder / f"{name}.py"
-    return file if file.name == f"{name}.py" and file.is_file() else None
+    file = folder and folder / f"{name}.py"
+    return file if file and file.name == f"{name}.py" and file.is_file() else None
 
 
 def load_effect(name: str, folder: Path | None = None) -> Effect:
     """The effect `name`: from `folder` if it has a file of that name, else from the package."""
-    if folder and (file := effect_file(name, folder)):
+    if file := effect_file(name, folder):
         try:
             return _effect(name, _import_file(name, file))
         except (InputError, KeyboardInterrupt):
@@ -284,9 +297,9 @@ def load_effect(name: str, folder: Path | None = None) -> Effect:
         except BaseException as error:  # SystemExit too: a user's code does not end ours without a word
             raise failed(file, error) from error
     if name not in known_effects():
-        known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
+        known = [*known_effects(), *(effects_in(folder) if folder else ())]
         raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
-    return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
+    return _effect(name, package_effects()[name])
 
 
 def failed(file: Path, error: BaseException) -> InputError:
@@ -295,20 +308,11 @@ def failed(file: Path, error: BaseException) -> InputError:
 
 
 def _import_file(name: str, file: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"gz_onboard_user_effects.{name}", file)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    # Not `exec_module`, which would take bytecode from a folder next to the file that may be anybody's.
+    module = sys.modules[f"gz_onboard_user_effects.{name}"] = ModuleType(f"gz_onboard_user_effects.{name}")
+    module.__file__ = str(file)
+    # Not by an import, which would take bytecode from a folder next to the file that may be anybody's.
     exec(compile(file.read_bytes(), file, "exec", dont_inherit=True), module.__dict__)
     return module
-
-
-@cache
-def _package_parameters() -> frozenset[str]:
-    """The names of the parameters of the vehicle and of the package's effects."""
-    modules = (importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects())
-    return frozenset(p.name for declared in (VEHICLE_PARAMETERS, *(m.PARAMETERS for m in modules)) for p in declared)
 
 
 def _effect(name: str, module: ModuleType) -> Effect:
@@ -317,12 +321,8 @@ def _effect(name: str, module: ModuleType) -> Effect:
     for attribute in ("PORT", "PARAMETERS", "term"):
         if not hasattr(module, attribute):
             raise InputError(f"{file}: an effect needs {attribute}")
-    equations = {key: Equation.of(getattr(module, key)) for key in ("decay", "variation") if hasattr(module, key)}
-    if decay := equations.get("decay"):
-        if decay.quantities[:1] != ("dt",):
-            raise InputError(f"{file}: the first argument of decay must be dt")
-        equations["decay"] = replace(decay, quantities=decay.quantities[1:])
     declared = tuple(parameter.name for parameter in module.PARAMETERS)
+    equations = {key: Equation.of(getattr(module, key)) for key in ("decay", "variation") if hasattr(module, key)}
     traits = ("shown_by", "stores_energy", "turning_loss", "strengths", "varies", "cause")
     given = {trait: getattr(module, trait.upper()) for trait in traits if hasattr(module, trait.upper())}
     effect = Effect(
@@ -333,14 +333,22 @@ def _effect(name: str, module: ModuleType) -> Effect:
         doc=inspect.getdoc(module) or "",
         **{"strengths": declared[:1]} | equations | given,
     )
+    if effect.decay and effect.decay.quantities[:1] != ("dt",):
+        raise InputError(f"{file}: the first argument of decay must be dt")
     for quantity in effect.reads - QUANTITIES.keys():
         raise InputError(f"{file}: no quantity is called {quantity!r}{nearest(quantity, QUANTITIES)}")
-    foreign = effect.takes.difference(declared)
-    if not effect.takes.issuperset(declared) or (foreign and foreign - _package_parameters()):
+    of_others = effect.takes.difference(declared)
+    if not effect.takes.issuperset(declared) or of_others - (of_others and _package_parameters()):
         raise InputError(f"{file}: PARAMETERS declares {list(declared)}, term and decay take {sorted(effect.takes)}")
     if not isinstance(module.PORT, Port):
         raise InputError(f"{file}: PORT must be one of {', '.join(f'Port.{port.name}' for port in Port)}")
     return effect
+
+
+def _package_parameters() -> frozenset[str]:
+    """The names of the parameters of the vehicle and of the package's effects."""
+    declared = (VEHICLE_PARAMETERS, *(module.PARAMETERS for module in package_effects().values()))
+    return frozenset(parameter.name for parameters in declared for parameter in parameters)
 
 
 # --- the effects of a vehicle file, whose code runs only if nobody else can change it ---------------------------------
@@ -374,31 +382,28 @@ def read_effects(
     table.only(["effects", "effects_folder"])
     own = _own_folder(table)
     names = table.texts("effects", "names of effects") if "effects" in table.values else BASE_EFFECTS
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise table.error(f"{shown(twice)} is there twice", "effects")
-    effects = []
+    effects: dict[str, Effect] = {}
     for name in names:
+        if name in effects:
+            raise table.error(f"{shown(name)} is there twice", "effects")
         table.check_path("effects", name)
         try:
-            given = effect_file(name, folder) if folder else None
-            file = effect_file(name, own) if own and not given else None
+            file = None if effect_file(name, folder) else effect_file(name, own)
             if file:
                 _check_trust(vehicle.file, file, trusted_users() if users is None else users)
-            effects.append(load_effect(name, own if file else folder or own))
+            effects[name] = load_effect(name, own if file else folder or own)
         except Exception as error:
             raise table.error(str(error), "effects") from error
-    return tuple(effects)
+    return tuple(effects.values())
 
 
 def _own_folder(model: Table) -> Path | None:
     """The file's ``effects_folder``, which must lie in the file's folder."""
     if "effects_folder" not in model.values:
         return None
-    name = model.check_path("effects_folder", model.text("effects_folder"))
-    folder = model.file.parent / name
-    if Path(name).is_absolute() or not folder.resolve().is_relative_to(model.file.parent.resolve()):
-        raise model.error(f"{name!r} is not below the vehicle file's own folder", "effects_folder")
+    folder = model.file.parent / model.check_path("effects_folder", model.text("effects_folder"))
+    if not folder.resolve().is_relative_to(model.file.parent.resolve()):
+        raise model.error(f"{shown(str(folder))} is not below the vehicle file's own folder", "effects_folder")
     if not folder.is_dir():
         raise model.error(f"no folder {folder}", "effects_folder")
     return folder
@@ -408,12 +413,11 @@ def _check_trust(vehicle: Path, effect: Path, users: Collection[int]) -> None:
     """InputError if `effect` leaves the vehicle file's folder by a link, or others can change it or the file."""
     if not effect.resolve().is_relative_to(vehicle.parent.resolve()):
         raise InputError(f"{effect} is a link that leads out of the vehicle file's folder")
-    for file in (vehicle, effect):
-        if reason := changeable(file, users):
-            raise InputError(
-                f"{effect.name} beside the file is code, and not run: {reason}; "
-                "`run` and `discover` take a folder that you trust by --effects"
-            )
+    if reason := changeable(vehicle, users) or changeable(effect, users):
+        raise InputError(
+            f"{effect.name} next to the file is code, and not run: {reason}; "
+            "`run` and `discover` take a folder that you trust by --effects"
+        )
 
 
 def trusted_users() -> frozenset[int]:

@@ -5,13 +5,12 @@ Backward in the sense of simulation (speed in, power out); of floats and numpy a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from typing import Any
 
 from gz_onboard.constants import KELVIN
 from gz_onboard.physics.battery import QUICK, Battery, Overpotential
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port
+from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Effect, Port
 from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxed, sqrt
 from gz_onboard.physics.parameters import Parameters
 
@@ -28,19 +27,19 @@ class Bound:
     """An effect with the values of its parameters.
 
     term: its value as a function of quantities by name, floats or arrays; of an effect with memory, the value at which
-    it settles. bare_term, bare_decay: the same of quantities by position.
+    it settles. has_fixed_time: nothing but its parameters decides how fast it settles.
     """
 
     def __init__(self, effect: Effect, parameters: Mapping[str, float]) -> None:
         self.effect = effect
-        self._values = {name: parameters[name] for name in effect.takes}
-        self.bare_term = effect.term.with_parameters(parameters)
-        self.bare_decay = effect.decay and effect.decay.with_parameters(parameters)
-        self.term = _reader(effect.term.quantities)(self.bare_term)
+        self.values = {name: parameters[name] for name in effect.takes}
+        self.term = effect.term.bound(self.values)
+        self._decay = effect.decay and effect.decay.bound(self.values)
+        self.has_fixed_time = effect.decay is None or effect.decay.quantities == ("dt",)
 
     def __reduce__(self) -> tuple[type[Bound], tuple[Effect, dict[str, float]]]:
         """Pickle effect and values: another process does not know the functions of a user's file."""
-        return Bound, (self.effect, self._values)
+        return Bound, (self.effect, self.values)
 
     def __call__(self, quantities: Mapping[str, Any]) -> Any:
         """See `term`."""
@@ -48,49 +47,11 @@ class Bound:
 
     def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
         """The factor by which its state decays over `dt` [s]; 0 for an effect without memory."""
-        if self.effect.decay is None or self.bare_decay is None:
-            return 0.0
-        return self.bare_decay(dt, *[quantities[name] for name in self.effect.decay.quantities])
+        return self._decay(quantities, dt) if self._decay else 0.0
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
         """Its value `dt` [s] after `state`."""
-        return float(relaxed(state, self(quantities), self.decay(dt, quantities)))
-
-
-def _call(function: str, names: Iterable[str]) -> str:
-    """Source of a call of `function` with the quantities `names` out of a dictionary ``q``."""
-    return f"{function}({', '.join(f'q[{name!r}]' for name in names)})"
-
-
-@cache
-def _reader(names: tuple[str, ...]) -> Callable[[Callable[..., Any]], Callable[[Mapping[str, Any]], Any]]:
-    """Turns a function of the quantities `names` into one of a dictionary of quantities."""
-    return eval(f"lambda function: lambda q: {_call('function', names)}")  # type: ignore[no-any-return]
-
-
-def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
-    """A function from quantities (floats) to the values of `effects`, to be called once each step of `dt` [s].
-
-    Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
-    loops and layers of calls: a simulation calls it a hundred times for each second ridden.
-    """
-    scope: dict[str, Any] = {}
-    lines = []
-    for i, bound in enumerate(effects):
-        decay = bound.effect.decay
-        scope[f"term{i}"] = bound.bare_term
-        call = _call(f"term{i}", bound.effect.term.quantities)
-        if decay and bound.bare_decay and dt is not None:
-            scope[f"value{i}"], scope[f"decay{i}"] = 0.0, partial(bound.bare_decay, dt)
-            if not decay.quantities:
-                scope[f"kept{i}"] = bound.bare_decay(dt)
-            kept = _call(f"decay{i}", decay.quantities) if decay.quantities else f"kept{i}"
-            lines += [f"global value{i}", f"k = {kept}"]
-            call = f"k * value{i} + (1 - k) * {call}"
-        lines.append(f"value{i} = {call}")
-    values = "".join(f"value{i}, " for i in range(len(effects)))
-    exec("\n    ".join(["def values(q):", *lines, f"return ({values})"]), scope)
-    return scope["values"]  # type: ignore[no-any-return]
+        return float(relaxed(state, self.term(quantities), self.decay(dt, quantities)))
 
 
 Recall = Callable[[Bound, Mapping[str, Any]], Any]
@@ -108,25 +69,30 @@ def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
     return recall
 
 
-def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
-    """The value of `effect`; with memory, as `recall` gives it, or settled without `recall`."""
-    return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
-
-
-def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
-    """The sum of the values of `effects`: see `value_of`."""
-    return sum((value_of(effect, quantities, recall) for effect in effects), 0.0)
-
-
-def all_quantities(**known: Any) -> dict[str, Any]:
-    """All quantities that effects read, floats or arrays: `known`, the cosine of its ``grade``, and 0 for the rest."""
-    cosine = sqrt(1 - known["grade"] * known["grade"]) if "grade" in known else 1.0
-    return dict.fromkeys(QUANTITIES, 0.0) | {"grade_cosine": cosine} | known
-
-
 def drag_torque(power: Any, motor_speed: Any) -> Any:
     """Torque [N·m] against the motion by which `power` [W] of loss at no current slows the motor; 0 at standstill."""
     return power * motor_speed / (motor_speed * motor_speed + STANDSTILL * STANDSTILL)
+
+
+class EffectGroup:
+    """The values of some effects at once. settled: all of them, in order, with no memory."""
+
+    def __init__(self, effects: Sequence[Bound]) -> None:
+        self.names = [bound.effect.name for bound in effects]
+        scope: dict[str, Any] = {}
+        for i, bound in enumerate(effects):
+            scope |= bound.effect.term.scope(f"term{i}", bound.values)
+        calls = "".join(f"{bound.effect.term.source(f'term{i}')}, " for i, bound in enumerate(effects))
+        self.settled: Callable[[Mapping[str, Any]], tuple[Any, ...]] = eval(f"lambda q: ({calls})", scope)
+        self._with_memory = [(i, bound) for i, bound in enumerate(effects) if bound.effect.decay]
+
+    def at(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> Sequence[Any]:
+        """The values in order; of those with memory as `recall` gives them, or settled without `recall`."""
+        values = self.settled(quantities)
+        if recall is None or not self._with_memory:
+            return values
+        recalled = {i: recall(bound, quantities) for i, bound in self._with_memory}
+        return [recalled.get(i, value) for i, value in enumerate(values)]
 
 
 class Model:
@@ -135,20 +101,26 @@ class Model:
     def __init__(self, effects: tuple[Effect, ...], parameters: Parameters) -> None:
         self.effects = effects
         self.parameters = parameters
-        self._at: dict[Port, list[Bound]] = {port: [] for port in Port}
-        for effect in effects:
-            self._at[effect.port].append(Bound(effect, parameters))
         self.reads: frozenset[str] = frozenset().union(*(effect.reads for effect in effects))
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
+        self._bound = [Bound(effect, parameters) for effect in effects]
+        self._road, self._motor = EffectGroup(self.at(*ROAD_LOAD)), EffectGroup(self.at(Port.MOTOR_LOSS))
+        self._electric = EffectGroup(self.at(Port.INVERTER_LOSS, Port.DC_POWER))
         self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
+        self._regeneration_limit = parameters["regeneration_torque_limit"]
+        self._torque_constant = parameters["torque_constant"]
+
+    def __reduce__(self) -> tuple[type[Model], tuple[tuple[Effect, ...], Parameters]]:
+        """Pickle effects and parameters: another process does not know the functions made of them."""
+        return Model, (self.effects, self.parameters)
 
     def at(self, *ports: Port) -> list[Bound]:
         """The effects at these ports."""
-        return [effect for port in ports for effect in self._at[port]]
+        return [bound for port in ports for bound in self._bound if bound.effect.port is port]
 
     def idle_loss(self, quantities: Mapping[str, Any]) -> Any:
         """Loss of the motor [W] turning without current: drag on the shaft, which the motor's current makes up for."""
-        return total(self._at[Port.MOTOR_LOSS], {**quantities, "torque": 0.0, "motor_current": 0.0})
+        return sum(self._motor.settled({**quantities, "torque": 0.0, "motor_current": 0.0}))
 
     def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
         """The ledger [W]: the power that each effect takes out of the pack, by name, moving as `quantities` say.
@@ -160,24 +132,18 @@ class Model:
         energy are the entries ``inertia`` and ``grade_force``.
         """
         q = dict(quantities)
-        speed = q["speed"]
-        ledger: dict[str, Any] = {}
-        force = 0.0
-        for bound in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
-            term = value_of(bound, q, recall)
-            force = force + term
-            ledger[bound.effect.name] = term * speed
+        speed, road = q["speed"], self._road.at(q, recall)
+        ledger = {name: force * speed for name, force in zip(self._road.names, road, strict=True)}
         motor_speed = speed * self._motor_per_speed
-        wanted = force / self._motor_per_speed  # torque at the motor's shaft
-        limit = -self.parameters["regeneration_torque_limit"]
+        wanted = sum(road) / self._motor_per_speed  # torque at the motor's shaft
+        limit = -self._regeneration_limit
         torque = (wanted + limit + abs(wanted - limit)) / 2  # the greater of both, for arrays too
         ledger["brakes"] = (torque - wanted) * motor_speed
-        q["motor_speed"] = motor_speed
-        q["torque"] = torque + drag_torque(self.idle_loss(q), motor_speed)
-        q["motor_current"] = q["torque"] / self.parameters["torque_constant"]
-        for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER):
-            for bound in self._at[port]:
-                ledger[bound.effect.name] = value_of(bound, q, recall)
+        q["motor_speed"], q["torque"], q["motor_current"] = motor_speed, 0.0, 0.0
+        q["torque"] = torque + drag_torque(sum(self._motor.settled(q)), motor_speed)
+        q["motor_current"] = q["torque"] / self._torque_constant
+        ledger.update(zip(self._motor.names, self._motor.at(q, recall), strict=True))
+        ledger.update(zip(self._electric.names, self._electric.at(q, recall), strict=True))
         return ledger
 
     def overpotential(self, battery: Battery, others: Mapping[str, float] | None = None) -> Overpotential | None:
@@ -185,21 +151,20 @@ class Model:
 
         others: quantities that are not the cells' and that the effects may read; 0 if not given.
         """
-        effects = [(x, _share_of_bursts(x), share_that_ages(x)) for x in self._at[Port.CELL_VOLTAGE]]
+        effects = [(x, x.term, _share_of_bursts(x), share_that_ages(x)) for x in self.at(Port.CELL_VOLTAGE)]
         if not effects:
             return None
-        usual = dict.fromkeys(QUANTITIES, 0.0) | dict(others or {})
+        q, health = dict.fromkeys(QUANTITIES, 0.0) | dict(others or {}), battery.health
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
-            q = usual.copy()
             q["soc"], q["cell_temperature"] = soc, temperature
             q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
-            for effect, known, ages in effects:
-                q["cell_current"] = load = battery.health.carried(current, ages)
+            for effect, term, known, ages in effects:
+                q["cell_current"] = load = health.carried(current, ages)
                 share = mean_response(effect.decay(BURST, q)) if known is None else known
                 if form_factor_squared == 1 or share < UNMOVED:
-                    lost += effect.term(q)
+                    lost += term(q)
                     continue
                 # The charge flows in bursts. An effect that is fast enough follows the current, not its mean. A gamma
                 # distribution of currents of this form factor, weighted with the charge, has the mean and sd of two
@@ -208,7 +173,7 @@ class Model:
                 apart = sqrt((bursts - 1) / bursts)
                 for part in (1 - apart, 1 + apart):
                     q["cell_current"] = part * bursts * load
-                    lost += effect.term(q) / 2
+                    lost += term(q) / 2
             return lost
 
         return settled
@@ -224,8 +189,7 @@ STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to 
 
 def _share_of_bursts(effect: Bound) -> float | None:
     """How much of a burst an effect in the cells shows in the mean over it; None if the cells' state decides."""
-    decay = effect.effect.decay
-    return None if decay and decay.quantities else mean_response(effect.decay(BURST, {}))
+    return mean_response(effect.decay(BURST, {})) if effect.has_fixed_time else None
 
 
 def share_that_ages(effect: Bound) -> float:
@@ -233,8 +197,7 @@ def share_that_ages(effect: Bound) -> float:
 
     Slower effects, such as diffusion, do not show in those changes, and grow differently with age.
     """
-    decay = effect.effect.decay
-    return 1.0 if decay and decay.quantities else 1 - float(effect.decay(QUICK, {}))
+    return 1 - float(effect.decay(QUICK, {})) if effect.has_fixed_time else 1.0
 
 
 def standing_load(current: float, voltage: float, auxiliary_power: float) -> float:

@@ -281,14 +281,6 @@ class Parameters(Mapping[str, float]):
         """The value of `name` in the vehicle file, before another was entered."""
         return self._filed.get(name, self[name])
 
-    def covariance(self, names: Sequence[str]) -> list[list[float]]:
-        """The covariance of the parameters `names`, in the products of their units."""
-
-        def correlation(a: str, b: str) -> float:
-            return 1.0 if a == b else self.correlations.get(frozenset((a, b)), 0.0)
-
-        return [[correlation(a, b) * self.sd(a) * self.sd(b) for b in names] for a in names]
-
     def replaced(self, **values: float) -> Parameters:
         """The same with other values, which whoever enters them is taken to know well: a tenth of the sd.
 
@@ -302,12 +294,6 @@ class Parameters(Mapping[str, float]):
             filed.setdefault(name, self[name])
             known[name] = Value(value, 0.1 * self.sd(name), p.unit, "data sheet", "as entered")
         return Parameters(known, self.correlations, self.declared, filed)
-
-    def joined(self, effects: Iterable[Effect]) -> Parameters:
-        """The same with the parameters of `effects` that are not yet known, at their priors."""
-        new = {p.name: p for effect in effects for p in effect.parameters if p.name not in self.known}
-        values = {name: _prior(p) for name, p in new.items()}
-        return Parameters({**self.known, **values}, self.correlations, {**self.declared, **new}, self._filed)
 
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:

@@ -9,8 +9,8 @@ from math import hypot, log, sqrt
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY, MILD, WH_PER_KM
-from gz_onboard.physics.effect import failed
-from gz_onboard.physics.model import Bound, air_density, all_quantities
+from gz_onboard.physics.effect import QUANTITIES, Port, failed
+from gz_onboard.physics.model import air_density
 
 if TYPE_CHECKING:
     from gz_onboard.physics.model import Model
@@ -125,22 +125,23 @@ def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
 
     Also if the code of an effect raises an error there.
     """
-    ordinary = all_quantities(
-        mass=model.mass,
-        air_density=air_density(MILD),
-        motor_temperature=MILD,
-        ambient_temperature=MILD,
-        cell_temperature=MILD,
-        cell_capacity=model.parameters["cell_capacity"],
-        soc=0.5,
-        lateral_acceleration=riding.lateral_acceleration,
-        vibration=riding.vibration,
-    )
-    for effect, (_, speed, acceleration) in product(model.effects, riding.points):
+    ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
+        "grade_cosine": 1.0,
+        "mass": model.mass,
+        "air_density": air_density(MILD),
+        "motor_temperature": MILD,
+        "ambient_temperature": MILD,
+        "cell_temperature": MILD,
+        "cell_capacity": model.parameters["cell_capacity"],
+        "soc": 0.5,
+        "lateral_acceleration": riding.lateral_acceleration,
+        "vibration": riding.vibration,
+    }
+    for bound, (_, speed, acceleration) in product(model.at(*Port), riding.points):
         try:
-            float(Bound(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))
+            float(bound(ordinary | {"speed": speed, "acceleration": acceleration}))
         except (Exception, SystemExit) as error:  # of a user's own: better here than on the road
-            raise failed(effect.file, error) from error
+            raise failed(bound.effect.file, error) from error
     power = sum(
         share * sum(model.power(ordinary | {"speed": speed, "acceleration": acceleration}).values())
         for share, speed, acceleration in riding.points

@@ -18,8 +18,8 @@ from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell
 from gz_onboard.dashboard.view import Picture, View
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import Activity, Estimate
-from gz_onboard.physics.derating import Derating
 from gz_onboard.physics.functions import PiecewiseLinear
+from gz_onboard.physics.tables import Derating
 from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.served import PACK, Own, cells, odometer, own_frame
 from tests.dashboard.test_picture import BUS, HEALTHY

@@ -14,7 +14,7 @@ from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
 from tests.events import EventEstimator
-from tests.support import without_cell_effects
+from tests.support import joined, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
 AIR = Conditions(20.0, 0.0)
@@ -22,7 +22,7 @@ AIR = Conditions(20.0, 0.0)
 
 def extended(*names: str, **values: float) -> Vehicle:
     effects = [load_effect(name) for name in names]
-    return BASE.changed(BASE.parameters.joined(effects).replaced(**values), (*BASE.model.effects, *effects))
+    return BASE.changed(joined(BASE.parameters, effects).replaced(**values), (*BASE.model.effects, *effects))
 
 
 def estimator(vehicle: Vehicle) -> EventEstimator:
@@ -308,7 +308,7 @@ def test_memory_between_road_and_pack_steps_each_second(tmp_path):
         "    return exp(-dt / 60.0)\n"
     )
     effect = load_effect("slow_drag", tmp_path)
-    vehicle = BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+    vehicle = BASE.changed(joined(BASE.parameters, [effect]), (*BASE.model.effects, effect))
     fresh, settled = forecaster(vehicle), forecaster(vehicle)
     settled.load.states["slow_drag"] = 20.0
     shares = []

@@ -26,7 +26,7 @@ from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
 from tests.events import EventEstimator
-from tests.support import ridden, without_cell_effects
+from tests.support import joined, ridden, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
 ROUGH = """\"\"\"Drag of a rough road, in proportion to the vibration, made up for a test.\"\"\"
@@ -45,7 +45,7 @@ TYPICAL = BASE.riding.vibration
 def vehicle_with(folder: Path, port: str = "WHEEL_FORCE", value: float = NEWTONS) -> Vehicle:
     (folder / "rough_road.py").write_text(ROUGH.format(port=port, value=value))
     effect = load_effect("rough_road", folder)
-    return BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+    return BASE.changed(joined(BASE.parameters, [effect]), (*BASE.model.effects, effect))
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.offline.series import all_quantities
 from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import air_density, all_quantities
+from gz_onboard.physics.model import air_density
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

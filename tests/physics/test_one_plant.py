@@ -23,10 +23,10 @@ from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, mesh_over, ocv_over
+from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, mesh_over, ocv_over, stepper
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear
-from gz_onboard.physics.model import air_density, stepper
+from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Scooter

@@ -12,6 +12,7 @@ from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
+from tests.support import joined
 
 VEHICLE = read_vehicle("reference", 75.0)
 
@@ -55,7 +56,7 @@ def test_agrees_with_the_forward_simulation_on_a_cycle():
 @pytest.mark.parametrize("effects", [(), ("tyre_warm_up", "drivetrain_drag", "headwind")])
 def test_blocks_are_one_ride(effects, monkeypatch):
     more = [load_effect(name) for name in effects]
-    vehicle = VEHICLE.changed(VEHICLE.parameters.joined(more), (*VEHICLE.model.effects, *more))
+    vehicle = VEHICLE.changed(joined(VEHICLE.parameters, more), (*VEHICLE.model.effects, *more))
     t = np.arange(0, 60, 0.01)
     v, grade = 8 + 4 * np.sin(t / 7), 0.02 * np.sin(t / 5)
     conditions = RideConditions(grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)

@@ -18,7 +18,7 @@ from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, latency
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
-from tests.support import without_cell_effects
+from tests.support import joined, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference"))
 CANDIDATES = (
@@ -35,7 +35,7 @@ CANDIDATES = (
 
 def extended(*names: str, **values: float) -> Vehicle:
     effects = [load_effect(name) for name in names]
-    return BASE.changed(BASE.parameters.joined(effects).replaced(**values), (*BASE.model.effects, *effects))
+    return BASE.changed(joined(BASE.parameters, effects).replaced(**values), (*BASE.model.effects, *effects))
 
 
 def per_metre(run: Run) -> float:
@@ -149,7 +149,7 @@ def decay(dt, motor_speed):
 def test_a_motor_loss_with_memory_goes_on_once_each_step(tmp_path):
     (tmp_path / "bearing.py").write_text('"""Made up."""\n' + BEARING)
     effect = load_effect("bearing", tmp_path)
-    vehicle = BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+    vehicle = BASE.changed(joined(BASE.parameters, [effect]), (*BASE.model.effects, effect))
     scooter = Scooter(vehicle, straight(), soc=0.8, speed=8.0)
     value, energy = 0.0, 0.0
     for _ in range(50):

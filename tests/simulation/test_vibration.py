@@ -25,7 +25,7 @@ from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-from tests.support import LOGS, without_cell_effects
+from tests.support import LOGS, joined, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference"))
 RIDE = LOGS / "coastdown.blf"
@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def extended(folder: Path, *names: str) -> Vehicle:
     effects = [load_effect(name, folder) for name in names]
-    return BASE.changed(BASE.parameters.joined(effects), (*BASE.model.effects, *effects))
+    return BASE.changed(joined(BASE.parameters, effects), (*BASE.model.effects, *effects))
 
 
 def stop_and_go(scooter: Scooter) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gz_onboard.arrays import Array
 from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery_file import LIMITS
+from gz_onboard.physics.tables import LIMITS
 
 FEWEST = 50  # samples
 VOLTAGE = (0.2, 6.0)  # V: of one cell of any chemistry, under any load

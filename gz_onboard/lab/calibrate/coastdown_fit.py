@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import permutations
 from math import sqrt
 
 import numpy as np
@@ -229,8 +230,8 @@ def covariance_with_inputs(
     x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
     correlation = np.eye(len(moved))
-    sds = np.array([p.sd(name) for name in drag])
-    correlation[: len(drag), : len(drag)] = np.array(p.covariance(drag)) / np.outer(sds, sds)
+    for (i, a), (j, b) in permutations(enumerate(drag), 2):
+        correlation[i, j] = p.correlations.get(frozenset((a, b)), 0.0)
     at_names = [solution.names.index(name) for name in names]
     covariance = solution.part(list(names)) + (shift @ correlation @ shift.T)[np.ix_(at_names, at_names)]
     row = solution.names.index("drag_area")

@@ -19,9 +19,9 @@ from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.cooling import PERIOD
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import road_speed, true_columns
-from gz_onboard.offline.series import first_soc
+from gz_onboard.offline.series import all_quantities, first_soc, total
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import STOOD, all_quantities, stepping, total
+from gz_onboard.physics.model import STOOD, stepping
 from gz_onboard.vehicle import Vehicle
 
 FIRST = 1.0  # s: whose mean voltage and current tell the state of charge at the start, before the load has grown

@@ -17,9 +17,10 @@ from scipy.optimize import minimize_scalar
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import Coast
 from gz_onboard.offline.sensors import road_speed
+from gz_onboard.offline.series import all_quantities, total
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.model import Bound, air_density, all_quantities, total
+from gz_onboard.physics.model import Bound, air_density
 from gz_onboard.vehicle import Vehicle
 
 STRONGEST = 8.0  # m/s: a wind in which nobody coasts down

@@ -20,8 +20,9 @@ from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.arrays import running_mean
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import Vibration, road_speed
+from gz_onboard.offline.series import total
 from gz_onboard.physics.effect import MOVING, Port
-from gz_onboard.physics.model import air_density, total
+from gz_onboard.physics.model import air_density
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 from gz_onboard.vehicle import Vehicle
 

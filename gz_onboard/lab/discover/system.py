@@ -10,10 +10,10 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
-from gz_onboard.offline.series import series
+from gz_onboard.offline.series import series, value_of
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
-from gz_onboard.physics.model import Bound, value_of
+from gz_onboard.physics.model import Bound
 from gz_onboard.physics.riding import PriorRiding
 
 Values = Mapping[str, float]
@@ -55,7 +55,7 @@ class System:
             value = value_of(Bound(effect, p), known, recall)
             if effect.variation:
                 healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
-                value = value * effect.variation.at(known, {**p, **healthy})
+                value = value * effect.variation.bound({**p, **healthy})(known)
             found.append((effect, value))
         return found
 

@@ -14,8 +14,9 @@ from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, UNRELATED, Seconds, rate, relation, too_little, unit_of
+from gz_onboard.offline.series import all_quantities
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.model import air_density, all_quantities
+from gz_onboard.physics.model import air_density
 from gz_onboard.vehicle import Vehicle
 
 PACK = ("pack_voltage", "pack_current")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Protocol
 
-from gz_onboard.physics.model import Bound, stepper
+from gz_onboard.offline.series import stepper
+from gz_onboard.physics.model import Bound
 
 Quantities = MutableMapping[str, float]
 Ledger = MutableMapping[str, float]
@@ -24,7 +25,8 @@ class Losses:
         values, dt = self._values(quantities), self._dt
         for i, name in self._names:
             ledger[name] += values[i] * dt
-        return sum(values)
+        total: float = sum(values)
+        return total
 
 
 class Motor(Protocol):
@@ -71,4 +73,4 @@ class EffectMotor:
         q = self._q
         q["motor_speed"], q["motor_temperature"] = speed, temperature
         q["motor_current"] = q["torque"] = 0.0
-        return sum(self._settled(q))
+        return float(sum(self._settled(q)))

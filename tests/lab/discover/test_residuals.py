@@ -11,7 +11,8 @@ from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial
 from gz_onboard.lab.discover.residuals import cell_temperature, counted_soc, start_soc
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.model import all_quantities, standing_load, total
+from gz_onboard.offline.series import all_quantities, total
+from gz_onboard.physics.model import standing_load
 from gz_onboard.vehicle import read_vehicle
 
 SECONDS, COLD, AMPERES, SOC = 120, 5.0, 30.0, 0.15
