@@ -107,9 +107,10 @@ def over(dt: Any) -> Recall:
     return lambda effect, quantities: series(effect, dt, quantities)
 
 
-def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, Any]], tuple[Any, ...]]:
-    """A function from quantities to the values of `effects`, to be called once each step of `dt` [s].
+def stepper(effects: Sequence[Bound], dt: float | None, booked: bool = False) -> Callable[..., Any]:
+    """A function from quantities to the tuple of the values of `effects`, to be called once each step of `dt` [s].
 
+    booked: it takes a ledger too, adds each value times `dt` to it by the name of the effect, and gives their sum.
     Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
     loops and layers of calls: a simulation calls it a hundred times for each second ridden.
     """
@@ -127,8 +128,11 @@ def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str
             lines += [f"global value{i}", f"k = {kept}"]
             call = f"k * value{i} + (1 - k) * {call}"
         lines.append(f"value{i} = {call}")
-    values = "".join(f"value{i}, " for i in range(len(effects)))
-    exec("\n    ".join(["def values(q):", *lines, f"return ({values})"]), scope)
+        if booked:
+            lines.append(f"ledger[{bound.effect.name!r}] += value{i} * dt")
+    values = [f"value{i}" for i in range(len(effects))]
+    result = " + ".join(values) or "0.0" if booked else f"({''.join(f'{value}, ' for value in values)})"
+    exec("\n    ".join([f"def values({'q, ledger' if booked else 'q'}):", *lines, f"return {result}"]), scope)
     return scope["values"]  # type: ignore[no-any-return]
 
 

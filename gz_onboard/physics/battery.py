@@ -277,9 +277,10 @@ class Battery:
         """
         weakest, cell = self.health.weakest, current / self.cells_parallel
         own, more = (weakest.soc(soc), weakest.resistance) if weakest else (soc, 0.0)
-        r0, r1, _ = self.circuit(own, temperature)
-        lost = overpotential(cell, own, temperature, 1.0) if overpotential else 0.0
-        return self.ocv(own, temperature)[0] - (1 + more) * ((r0 + r1) * cell + lost)
+        lost = (self.r0.at(own, temperature)[0] + self.r1.at(own, temperature)[0]) * cell
+        if overpotential:
+            lost += overpotential(cell, own, temperature, 1.0)
+        return self.ocv(own, temperature)[0] - (1 + more) * lost
 
     def settled_current(
         self,
@@ -300,9 +301,9 @@ class Battery:
         source = n * self.ocv(soc, temperature)[0]
         cell = form_factor_squared * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
         resistance = n * cell / m + form_factor_squared * self.series_resistance
-        current = current_of(power, source, resistance) if guess is None or overpotential is None else guess
         if overpotential is None:
-            return current
+            return current_of(power, source, resistance)
+        current = current_of(power, source, resistance) if guess is None else guess
         for _ in range(2 if guess is None else 1):  # it moves the current by a percent, and that moves it by a percent
             if current is not None:
                 lost = overpotential(current / m, soc, temperature, form_factor_squared)

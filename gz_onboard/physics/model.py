@@ -6,12 +6,13 @@ Backward in the sense of simulation (speed in, power out); of floats and numpy a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from math import sqrt
 from typing import Any
 
 from gz_onboard.constants import KELVIN
 from gz_onboard.physics.battery import QUICK, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Effect, Port
-from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxed, sqrt
+from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxed
 from gz_onboard.physics.parameters import Parameters
 
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
@@ -159,11 +160,13 @@ class Model:
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             q["soc"], q["cell_temperature"] = soc, temperature
             q["cell_capacity"] = battery.cell_capacity(temperature)
-            lost = 0.0
+            aged, lost = health.resistance - 1, 0.0
             for effect, term, known, ages in effects:
-                q["cell_current"] = load = health.carried(current, ages)
-                share = mean_response(effect.decay(BURST, q)) if known is None else known
-                if form_factor_squared == 1 or share < UNMOVED:
+                q["cell_current"] = load = (1 + aged * ages) * current
+                share = 0.0
+                if form_factor_squared > 1:
+                    share = mean_response(effect.decay(BURST, q)) if known is None else known
+                if share < UNMOVED:
                     lost += term(q)
                     continue
                 # The charge flows in bursts. An effect that is fast enough follows the current, not its mean. A gamma
@@ -171,9 +174,10 @@ class Model:
                 # currents, which tell what an effect loses that does not grow in proportion to the current.
                 bursts = 1 + (form_factor_squared - 1) * share
                 apart = sqrt((bursts - 1) / bursts)
-                for part in (1 - apart, 1 + apart):
-                    q["cell_current"] = part * bursts * load
-                    lost += term(q) / 2
+                q["cell_current"] = (1 - apart) * bursts * load
+                low = term(q)
+                q["cell_current"] = (1 + apart) * bursts * load
+                lost += (low + term(q)) / 2
             return lost
 
         return settled

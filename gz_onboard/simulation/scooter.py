@@ -25,7 +25,7 @@ from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.simulation.parts.controller import Controller
 from gz_onboard.simulation.parts.driveline import Driveline
-from gz_onboard.simulation.parts.motor import EffectMotor, Losses, Motor
+from gz_onboard.simulation.parts.motor import EffectMotor, Motor
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.parts.tyre import Tyre
 from gz_onboard.vehicle import Vehicle
@@ -125,8 +125,8 @@ class Scooter:
         cells = model.at(Port.CELL_VOLTAGE)
         inside = stepper(cells, dt) if cells else None
         self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
-        self._inverter = Losses(model.at(Port.INVERTER_LOSS), dt)
-        self._dc = Losses(model.at(Port.DC_POWER), dt)
+        self._inverter = stepper(model.at(Port.INVERTER_LOSS), dt, booked=True)
+        self._dc = stepper(model.at(Port.DC_POWER), dt, booked=True)
         constants = p["torque_constant"], p["voltage_constant"]
         self.motor: Motor = options.get("motor") or EffectMotor(model.at(Port.MOTOR_LOSS), dt, *constants, self._q)
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
@@ -266,8 +266,8 @@ class Scooter:
         dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
         q["motor_speed"], q["motor_current"], q["torque"] = motor_speed, current, self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
-        inverter_heat = self._inverter.total(q, entries)
-        power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries)
+        inverter_heat = self._inverter(q, entries)
+        power = mechanical + motor_heat + inverter_heat + self._dc(q, entries)
         self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
         bms_heat = self._bms_resistance * self.current * self.current  # in the pack's: the board lies in its current
         entries["bms"] += bms_heat * dt

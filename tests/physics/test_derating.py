@@ -66,7 +66,11 @@ def test_what_the_file_says_counts_the_rest_is_default(tmp_path):
             ["controller.current_by_motor_temperature.at", "1500 degC is outside -60 to 300 degC"],
         ),
         ("share = [0.1, 1.0]", "share = [0.1, 1.2]", ["controller.current_by_soc.share", "1.2 is outside 0 to 1"]),
-        ("share = [0.1, 1.0]", "share = [0.1]", ["controller.current_by_soc.share", "must be 2 numbers, one for each at"]),
+        (
+            "share = [0.1, 1.0]",
+            "share = [0.1]",
+            ["controller.current_by_soc.share", "must be 2 numbers, one for each at"],
+        ),
         ('0.0], unit = "rad/s"', '0.0], unit = "rpm"', ["current_by_motor_speed.unit", "'rpm'", "rad/s"]),
         ("regeneration_gain = { value = 50.0", "regeneration_gain = { value = -1.0", ["regeneration_gain.value", "-1"]),
         ("at = [7.0, 14.5]", 'at = [7.0, "fast"]', ["regeneration_by_motor_speed.at", "'fast'"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import MutableMapping, Sequence
 from typing import Protocol
 
 from gz_onboard.offline.series import stepper
@@ -11,22 +11,6 @@ from gz_onboard.physics.model import Bound
 Quantities = MutableMapping[str, float]
 Ledger = MutableMapping[str, float]
 """Energy [J] by name; what is not in it yet is 0."""
-
-
-class Losses:
-    """The effects at one port, summed and booked once each step of `dt` [s]."""
-
-    def __init__(self, effects: Sequence[Bound], dt: float) -> None:
-        self._names = [(i, bound.effect.name) for i, bound in enumerate(effects)]
-        self._values, self._dt = stepper(effects, dt), dt
-
-    def total(self, quantities: Mapping[str, float], ledger: Ledger) -> float:
-        """Their sum [W]; adds each [J] to `ledger` by its name."""
-        values, dt = self._values(quantities), self._dt
-        for i, name in self._names:
-            ledger[name] += values[i] * dt
-        total: float = sum(values)
-        return total
 
 
 class Motor(Protocol):
@@ -58,7 +42,7 @@ class EffectMotor:
     ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
-        self._losses, self._settled = Losses(effects, dt), stepper(effects, None)
+        self._losses, self._settled = stepper(effects, dt, booked=True), stepper(effects, None)
         self._q = quantities
 
     def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
@@ -66,7 +50,7 @@ class EffectMotor:
         q = self._q
         q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
         q["torque"] = self.torque_constant * current
-        return self._losses.total(q, ledger)
+        return float(self._losses(q, ledger))
 
     def idle(self, speed: float, temperature: float) -> float:
         """See `Motor`; not a step for an effect with memory."""
