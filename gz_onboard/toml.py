@@ -122,17 +122,14 @@ class Table:
             raise self.error(f"must be a whole number, is {value:g}", key)
         return int(value)
 
-    def numbers(self, key: str, low: float = -1e300, high: float = 1e300) -> tuple[float, ...]:
-        """Return the list of numbers `key`, each within [low, high]; 1 to `LONGEST_LIST`."""
+    def numbers(self, key: str, low: float = -1e300, high: float = 1e300, unit: str = "") -> tuple[float, ...]:
+        """Return the list of numbers `key`, each within [low, high]; 1 to `LONGEST_LIST`. unit: for messages."""
         numbers = self._list(key, f"must be a list of numbers, 1 to {LONGEST_LIST}")
-        return tuple(self._number_of(number, key, low, high) for number in numbers)
+        return tuple(self._number_of(number, key, low, high, unit) for number in numbers)
 
     def increasing(self, key: str, low: float, high: float, unit: str = "") -> tuple[float, ...]:
-        """Return the list of numbers `key` in `unit`, each within [low, high], which increase by `SMALLEST_STEP`."""
-        row, of = self.numbers(key), f" {unit}" if unit else ""
-        for x in row:
-            if not low <= x <= high:
-                raise self.error(f"{x:g}{of} is outside {low:g} to {high:g}{of}", key)
+        """Return `numbers` that increase by `SMALLEST_STEP` or more."""
+        row, of = self.numbers(key, low, high, unit), f" {unit}" if unit else ""
         for a, b in pairwise(row):
             if b - a < SMALLEST_STEP:
                 raise self.error(f"must increase, but {b:g}{of} follows {a:g}{of}", key)
@@ -153,13 +150,14 @@ class Table:
             raise self.error("is missing" if value is None else complaint, key)
         return value
 
-    def _number_of(self, value: object, key: str, low: float, high: float) -> float:
+    def _number_of(self, value: object, key: str, low: float, high: float, unit: str = "") -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(f"must be a number, is {shown(value)}", key)
         if not abs(value) <= 1e300:  # nan is not
             raise self.error(f"must be a finite number, is {shown(value)}", key)
         if not low <= value <= high:
-            raise self.error(f"{value:g} is outside {low:g} to {high:g}", key)
+            of = f" {unit}" if unit else ""
+            raise self.error(f"{value:g}{of} is outside {low:g} to {high:g}{of}", key)
         return float(value)
 
 

@@ -28,6 +28,9 @@ KEYS = (
     "correlation battery forecast controller healthy"
 )
 
+REMOVED = {"poll": "requests are not sent, only answers to another tester are read"}
+"""Keys of earlier versions, and why they are gone."""
+
 
 @dataclass(frozen=True)
 class Vehicle:
@@ -83,8 +86,7 @@ class Vehicle:
 
     def loaded(self, payload: float) -> Vehicle:
         """Return the vehicle with a rider and luggage of `payload` [kg]. InputError if out of range."""
-        parameters = self.parameters.replaced(payload_mass=payload)
-        return replace(self, parameters=parameters, model=Model(self.model.effects, parameters))
+        return self.changed(self.parameters.replaced(payload_mass=payload))
 
     @property
     def pack(self) -> Battery:
@@ -150,9 +152,7 @@ def read_vehicle(
     of several vehicles with this file.
     """
     table = Table.read(find_vehicle(name))
-    if "poll" in table.values:
-        raise table.error("was removed: requests are not sent, only answers to another tester are read", "poll")
-    table.only(KEYS.split())
+    table.only(KEYS.split(), removed=REMOVED)
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_effects(table, effects_folder, users)

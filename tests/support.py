@@ -42,7 +42,7 @@ def joined(parameters: Parameters, effects: Iterable[Effect]) -> Parameters:
     """The `parameters` with those of `effects` that are not among them, at their priors."""
     new = {p.name: p for effect in effects for p in effect.parameters if p.name not in parameters}
     values = {name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for name, p in new.items()}
-    return Parameters(parameters.known | values, parameters.correlations, parameters.declared | new)
+    return Parameters(parameters.known | values, parameters.declared | new)
 
 
 def write_log(file: Path, frames: Sequence[Frame]) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from gz_onboard.offline.arguments import checked, within
+from gz_onboard.offline.correlations import correlations
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.offline.table import signal_table
@@ -57,7 +58,9 @@ def read_vehicle(name: PathLike, payload: float | None = None, effects_folder: P
     """
     if payload is not None:
         within("payload", payload, {"payload": (0.0, MOST_PAYLOAD, "kg")})
-    return read_vehicle_file(file_of(name), payload, None if effects_folder is None else Path(effects_folder))
+    vehicle = read_vehicle_file(file_of(name), payload, None if effects_folder is None else Path(effects_folder))
+    correlations(vehicle)
+    return vehicle
 
 
 @checked

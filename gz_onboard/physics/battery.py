@@ -16,11 +16,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import sqrt
+from math import exp, sqrt
 from typing import Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear, decay_over, relaxed
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 
 T = TypeVar("T")
 Overpotential = Callable[[float, float, float, float], float]
@@ -212,8 +212,8 @@ class Battery:
 
     def relax(self, dt: float, v1: float, current: float, r1: float, c1: float) -> tuple[float, float]:
         """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""
-        decay = decay_over(dt, r1 * c1)
-        return relaxed(v1, r1 * current, decay), decay
+        decay = exp(-dt / (r1 * c1))
+        return decay * v1 + (1 - decay) * r1 * current, decay
 
     def advanced(
         self, dt: float, soc: float, v1: float, current: float, temperature: float

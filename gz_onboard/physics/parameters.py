@@ -5,20 +5,16 @@
 
 ``status`` is measured, data sheet or guess. A parameter that the file leaves out takes its prior, as a guess: that of a
 scooter, scaled to this vehicle (`Parameter.grows_with`). Parameters without a usable prior are required of a file with
-a battery. Parameters that were found together are correlated:
-
-    [correlation.coastdown]
-    parameters = ["drag_area", "rolling_resistance_constant"]
-    value = [[1.0, -0.86], [-0.86, 1.0]]
+a battery. The correlations of parameters that were found together are for offline tools, see `offline.correlations`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.effect import (
     CELLS,
     MASS,
@@ -255,13 +251,11 @@ class Parameters(Mapping[str, float]):
     def __init__(
         self,
         known: Mapping[str, Value],
-        correlations: Mapping[frozenset[str], float] | None = None,
         declared: Mapping[str, Parameter] | None = None,
         filed: Mapping[str, float] | None = None,
     ) -> None:
         self.known = dict(known)
         self._filed = dict(filed or {})  # values of the file that others have replaced
-        self.correlations = dict(correlations or {})
         self.declared = dict(declared or declared_parameters())  # with those of the user's own effects
 
     def __getitem__(self, name: str) -> float:
@@ -293,7 +287,7 @@ class Parameters(Mapping[str, float]):
                 raise InputError(f"{name}: {value:g} {p.unit} is outside {p.low:g} to {p.high:g} {p.unit}")
             filed.setdefault(name, self[name])
             known[name] = Value(value, 0.1 * self.sd(name), p.unit, "data sheet", "as entered")
-        return Parameters(known, self.correlations, self.declared, filed)
+        return Parameters(known, self.declared, filed)
 
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
@@ -322,7 +316,7 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
         size = relative_size(parameter.grows_with, sizes, usual) if name in grows else 1.0
         known[name] = given.get(name) or _prior(parameter, size)
         sizes[name] = known[name].value
-    return Parameters(known, _read_correlations(vehicle, known), declared)
+    return Parameters(known, declared)
 
 
 def relative_size(law: str, sizes: Mapping[str, float], usual: Mapping[str, float]) -> float:
@@ -374,47 +368,3 @@ def _check_required(vehicle: Table, given: Collection[str], effects: Iterable[Ef
         raise vehicle.table("parameters").error(
             f'must have {names}: no guess fits every vehicle. Give your own, with status = "guess" and an honest sd'
         )
-
-
-def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset[str], float]:
-    """The correlations of the tables ``correlation.NAME``; InputError for an impossible one."""
-    correlations: dict[frozenset[str], float] = {}
-    every = vehicle.table("correlation")
-    for group in every.values:
-        table = every.table(group)
-        table.only(["parameters", "value", "source"])
-        names = table.texts("parameters", "names of parameters")
-        for name in names:
-            if name not in known:
-                raise table.error(f"no parameter is called {shown(name)}{nearest(name, known)}", "parameters")
-            if names.count(name) > 1:
-                raise table.error(f"names {name!r} twice", "parameters")
-        n = len(names)
-        rows = table.rows("value", n, "as many as parameters", -1, 1)
-        if len(rows) != n:
-            raise table.error(f"must be {n} rows of {n} numbers, as many as parameters", "value")
-        for i, row in enumerate(rows):
-            for j, r in enumerate(row):
-                if r != rows[j][i]:
-                    raise table.error(f"row {i + 1}, column {j + 1}: {r:g} is not symmetric", "value")
-                if i == j and r != 1:
-                    raise table.error(f"the diagonal must be 1, is {r:g}", "value")
-                if i != j:
-                    correlations[frozenset((names[i], names[j]))] = r
-        if not _is_positive(rows):
-            raise table.error("no parameters can have these correlations together: a variance is negative", "value")
-    return correlations
-
-
-def _is_positive(rows: Sequence[Sequence[float]]) -> bool:
-    """Whether a symmetric matrix has no negative variance, except by rounding: all pivots of Gaussian elimination."""
-    while rows:
-        (pivot, *row), *others = rows
-        follows = pivot < 1e-6  # the parameter follows from those before it: its remainder must be rounding
-        if pivot < -1e-4 or (follows and any(abs(x) > 1e-2 for x in row)):
-            return False
-        rows = [
-            [x - (0.0 if follows else a * b / pivot) for x, b in zip(other[1:], row, strict=True)]
-            for a, other in zip(row, others, strict=True)
-        ]
-    return True

@@ -21,6 +21,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import SPAN, Coast
 from gz_onboard.lab.calibrate.fit import Solution, linear
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad
+from gz_onboard.offline.correlations import correlations
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.vehicle import Vehicle
@@ -230,8 +231,9 @@ def covariance_with_inputs(
     x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
     correlation = np.eye(len(moved))
+    tied = correlations(vehicle)
     for (i, a), (j, b) in permutations(enumerate(drag), 2):
-        correlation[i, j] = p.correlations.get(frozenset((a, b)), 0.0)
+        correlation[i, j] = tied.get(frozenset((a, b)), 0.0)
     at_names = [solution.names.index(name) for name in names]
     covariance = solution.part(list(names)) + (shift @ correlation @ shift.T)[np.ix_(at_names, at_names)]
     row = solution.names.index("drag_area")

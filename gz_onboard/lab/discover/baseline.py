@@ -70,7 +70,7 @@ def adopted(vehicle: Vehicle, mixed: MixedModel, before: MixedModel) -> Vehicle:
             source = f"{old.source}; refitted on {mixed.healthy} healthy rides"
             bounds = declared[name]
             known[name] = Value(float(np.clip(at[name], bounds.low, bounds.high)), wide, old.unit, "measured", source)
-    learned = replace(vehicle, parameters=Parameters(known, vehicle.parameters.correlations))
+    learned = replace(vehicle, parameters=Parameters(known))
     return replace(learned, healthy=replace(mixed, vehicle=learned))
 
 

@@ -38,6 +38,7 @@ from gz_onboard.lab.discover.prior import (
 from gz_onboard.lab.discover.residuals import counted_soc
 from gz_onboard.lab.discover.system import System
 from gz_onboard.lab.sizes import Sizes, sizes_of
+from gz_onboard.offline.correlations import correlations
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import Effect, Port
@@ -187,7 +188,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         scale=np.array([prior.scale for prior in priors.values()]),
         values=values,
         mean=np.zeros(len(names)),
-        prior=prior_covariance(priors, vehicle.parameters.correlations),
+        prior=prior_covariance(priors, correlations(vehicle)),
         scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
         noise={channel.name: channel.noise.scaled(sizes.of(channel.size)) for channel in CHANNELS},
         healthy=0,

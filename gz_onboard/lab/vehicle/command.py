@@ -13,6 +13,7 @@ from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked, check_log, chec
 from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.finding import Looks
 from gz_onboard.lab.vehicle.maps import WARM, efficiency_maps, fit_of
+from gz_onboard.offline.correlations import correlations
 from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.results import Failure, write_json
 from gz_onboard.offline.style import save
@@ -81,6 +82,7 @@ def check_vehicle(arguments: argparse.Namespace) -> int:
     if what := _no_vehicle(Path(arguments.vehicle)):
         raise InputError(f"{arguments.vehicle}: is {what}; the vehicle comes first, by name or file, then its logs")
     vehicle = read_vehicle(arguments.vehicle)
+    correlations(vehicle)
     logs = distinct_logs(arguments.logs)
     not_an_input([arguments.json], [*logs, find_vehicle(arguments.vehicle)])
     spoken = arguments.json != "-"

@@ -31,7 +31,7 @@ def vague(scooter: Vehicle) -> Vehicle:
     own = scooter.parameters
     known = {name: replace(value, sd=VAGUE.get(name, value.sd)) for name, value in own.known.items()}
     known["torque_constant"] = replace(known["torque_constant"], source="prior: of another vehicle")
-    return replace(scooter, parameters=Parameters(known, own.correlations, own.declared))
+    return replace(scooter, parameters=Parameters(known, own.declared))
 
 
 def rides(scooter: Vehicle, current: float) -> list[Samples]:
