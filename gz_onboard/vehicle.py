@@ -16,7 +16,7 @@ from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import Effect, read_effects
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters, read_parameters
-from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
+from gz_onboard.physics.riding import PriorRiding, read_riding
 from gz_onboard.physics.tables import Derating, read_battery, read_derating
 from gz_onboard.toml import Table, is_file
 
@@ -158,10 +158,7 @@ def read_vehicle(
     effects = read_effects(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     model, derating = Model(effects, parameters), read_derating(table)
-    spin = derating.top_spin
-    top_speed = spin and spin * parameters["wheel_radius"] / parameters["gear_ratio"]
-    riding = read_riding(table, model, top_speed)
-    check_riding(table, riding, model)
+    riding = read_riding(table, model, derating.top_spin)
     vehicle = Vehicle(
         name=_name(table),
         file=table.file,

@@ -10,7 +10,7 @@ a battery. The correlations of parameters that were found together are for offli
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -245,8 +245,8 @@ class Value:
     source: str
 
 
-class Parameters(Mapping[str, float]):
-    """The values by name. known: each with its unit, standard deviation and source."""
+class Parameters(dict[str, float]):
+    """The values by name; they do not change. known: each with its unit, standard deviation and source."""
 
     def __init__(
         self,
@@ -254,18 +254,10 @@ class Parameters(Mapping[str, float]):
         declared: Mapping[str, Parameter] | None = None,
         filed: Mapping[str, float] | None = None,
     ) -> None:
+        super().__init__({name: value.value for name, value in known.items()})
         self.known = dict(known)
-        self._filed = dict(filed or {})  # values of the file that others have replaced
         self.declared = dict(declared or declared_parameters())  # with those of the user's own effects
-
-    def __getitem__(self, name: str) -> float:
-        return self.known[name].value
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.known)
-
-    def __len__(self) -> int:
-        return len(self.known)
+        self._filed = dict(filed or {})  # values of the file that others have replaced
 
     def sd(self, name: str) -> float:
         """The standard deviation of `name`, in its unit."""

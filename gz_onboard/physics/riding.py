@@ -87,10 +87,10 @@ def usual_riding(model: Model, top_speed: float | None, usual: UsualRiding = Usu
     return replace(town, points=between, factor_sd=unknown, drift=ANYWHERE)
 
 
-def read_riding(vehicle: Table, model: Model, top_speed: float | None = None) -> PriorRiding:
+def read_riding(vehicle: Table, model: Model, top_spin: float | None = None) -> PriorRiding:
     """The table ``[forecast]`` of a vehicle file; a missing value is that of `usual_riding`.
 
-    ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²].
+    ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²]. top_spin: the motor's highest speed [rad/s].
     """
     table = vehicle.table("forecast")
     limits = {
@@ -103,10 +103,13 @@ def read_riding(vehicle: Table, model: Model, top_speed: float | None = None) ->
     }
     table.only(["riding", *limits, "source"])
     given = "riding" in table.values
+    top_speed = top_spin and top_spin * model.parameters["wheel_radius"] / model.parameters["gear_ratio"]
     riding = PriorRiding() if given else usual_riding(model, top_speed)
     points = _read_points(table) if given else riding.points
     numbers = {name: table.number(name, getattr(riding, name), *limit) for name, limit in limits.items()}
-    return replace(riding, points=points, **numbers)
+    riding = replace(riding, points=points, **numbers)
+    _check_riding(vehicle, riding, model)
+    return riding
 
 
 def _read_points(table: Table) -> tuple[tuple[float, float, float], ...]:
@@ -120,7 +123,7 @@ def _read_points(table: Table) -> tuple[tuple[float, float, float], ...]:
     return points
 
 
-def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
+def _check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
     """InputError if `riding` costs no energy by `model`, on a level road in mild air: then there would be no range.
 
     Also if the code of an effect raises an error there.

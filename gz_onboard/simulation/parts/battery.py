@@ -31,7 +31,7 @@ class PackModel(Protocol):
 class FirstOrderPack:
     """R0 and one RC pair over SOC and temperature, and the effects of the vehicle's model in the cells.
 
-    effects: a function that gives their voltages [V] after one step, see `physics.model.stepper`; its step is the
+    effects: a function that gives their voltages [V] after one step, see `offline.series.stepper`; its step is the
     `dt` of `draw`. They act in the next step. quantities: read by the effects; the pack keeps those of the cells up to
     date. The voltage lost to effects is heat of the pack. So is the energy that the RC pair's capacitor stores for a
     minute: heat = S·P·(V_oc - V_cell)·I_cell. Eq. 2.24 as printed mixes cell and pack voltage.
