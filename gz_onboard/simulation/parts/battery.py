@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
-from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
-from gz_onboard.physics.functions import decay_over, relaxed
+from gz_onboard.physics.battery import Battery, current_of
+from gz_onboard.physics.functions import decay_over
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
@@ -86,18 +86,19 @@ class FirstOrderPack:
         current = current_of(power, source, resistance)
         if current is None:
             current = source / (2 * resistance)
-        step = discharged(current, dt, self._capacity)
+        # Eqs. 2.21 to 2.24, written out: this runs a hundred times for each second ridden.
+        step = current * dt / (HOUR * self._capacity)
         # V_oc at the middle of the step, so that charge times voltage is the energy between the two SOCs.
         middle = n * (ocv - slope * step / 2)
-        voltage = terminal_voltage(middle, resistance, current, relaxing)
+        voltage = middle - resistance * current - relaxing
         self.soc -= step
         cell = current / m
-        self.v1 = relaxed(self.v1, self._r1 * cell, self._decay)
+        self.v1 = self._decay * self.v1 + (1 - self._decay) * self._r1 * cell
         if self._effects:
             q = self._q
             q["cell_current"], q["soc"] = cell, self.soc
             self.effect_voltages = self._effects(q)
-        return current, voltage, heat(middle, voltage, current), voltage * current
+        return current, voltage, (middle - voltage) * current, voltage * current
 
     def chemical_energy_drawn(self) -> float:
         """See `PackModel`: the integral of V_oc over the charge between the SOC at the start and now.
