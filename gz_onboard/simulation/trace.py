@@ -11,7 +11,6 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.offline.arrays import running_mean
-from gz_onboard.offline.series import over
 from gz_onboard.offline.series import all_quantities, over, total
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Bound
