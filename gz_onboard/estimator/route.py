@@ -27,8 +27,7 @@ from gz_onboard.physics.drawable import soc_left
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.functions import sqrt as root
-from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import Route
+from gz_onboard.routes.route import Route, speed_profile
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array

@@ -1,4 +1,4 @@
-"""A route as distance, grade, curvature, speed limit, and whatever else is known of the road.
+"""A route: grade, curvature and speed limit over distance, how it is read from a file, and the speed it allows.
 
 Altitude of a map or a receiver is off by a metre or so from point to point, and a bare difference over 20 m would
 turn that into grades of 5 %. Grade is therefore the slope of the straight line fitted (least squares) to the altitudes
@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import logging
 import math
+from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,23 +43,25 @@ class RouteFileConfig:
     max_gap: float = 5000.0  # points farther apart are places on the way, not the road
     min_altitude: float = -500.0
     max_altitude: float = 9000.0
+    profile_step: float = 5.0  # at most, between points of a speed profile
     near_zero: float = 20.0  # a road at sea level has heights within; on any other a height of 0 is a missing one
     min_distance_ratio: float = 0.5  # of the positions' length over distance_m
     max_distance_ratio: float = 1.2
 
 
 CONFIG = RouteFileConfig()
-_LIMITS = {f"speed_limit_{unit}": METRES_PER_SECOND[unit] for unit in ("mps", "kmh")}
-ROUTE_COLUMNS = (
-    "distance_m",
-    "latitude_deg",
-    "longitude_deg",
-    "altitude_m",
-    "curvature_1pm",
-    *_LIMITS,
-    "stop_s",
-    "headwind_mps",
-)
+SPEED_LIMITS = {f"speed_limit_{unit}": METRES_PER_SECOND[unit] for unit in ("mps", "kmh")}
+LIMITS = {  # of a column: least, most, unit
+    "latitude_deg": (-89.0, 89.0, "deg"),
+    "longitude_deg": (-180.0, 360.0, "deg"),
+    "altitude_m": (CONFIG.min_altitude, CONFIG.max_altitude, "m"),
+    "curvature_1pm": (-1.0, 1.0, "1/m"),
+    "speed_limit_mps": (0.1, 100.0, "m/s"),
+    "speed_limit_kmh": (0.36, 360.0, "km/h"),
+    "stop_s": (0.0, 3600.0, "s"),
+    "headwind_mps": (-40.0, 40.0, "m/s"),
+}
+ROUTE_COLUMNS = "distance_m", *LIMITS
 
 
 @dataclass(frozen=True)
@@ -114,41 +118,44 @@ def route_of(columns: Columns, name: str) -> Route:
     Raises InputError naming the place for a distance that does not increase, positions that do not move or do not fit
     the distance, points too far apart or too many, and values that no road has.
     """
+    import numpy as np
+
     if len(columns) > CONFIG.max_points:
         raise InputError(f"{columns.source}: has {len(columns)} points, must have at most {CONFIG.max_points}")
     columns = _with_filled_heights(columns)
     values = columns.values
-    for column, (low, high, unit) in {
-        "altitude_m": (CONFIG.min_altitude, CONFIG.max_altitude, "m"),
-        "curvature_1pm": (-1.0, 1.0, "1/m"),
-        "stop_s": (0.0, 3600.0, "s"),
-        "headwind_mps": (-40.0, 40.0, "m/s"),
-    }.items():
+    for column, limits in LIMITS.items():
         if column in values:
-            columns.check(column, low, high, unit)
-    steps = _steps(columns)
-    distance = _distance(columns, steps)
-    for row, (before, after) in enumerate(pairwise(distance), start=1):
-        if after - before > CONFIG.max_gap:
-            raise columns.error(row, f"is {(after - before) / 1000:.1f} km from the point before: that is no road")
+            columns.check(column, *limits)
+    speed_limits = [column for column in SPEED_LIMITS if column in values]
+    if len(speed_limits) > 1:
+        raise InputError(f"{columns.source}: has {' and '.join(speed_limits)}; must have one speed limit")
+    speed_limit = (math.inf,) * len(columns)
+    for column in speed_limits:
+        speed_limit = tuple(limit * SPEED_LIMITS[column] for limit in values[column])
+    distance, track = _distance(columns)
+    gaps = np.diff(distance)
+    if gaps.max() > CONFIG.max_gap:
+        far = f"is {gaps.max() / 1000:.1f} km from the point before: that is no road"
+        raise columns.error(int(gaps.argmax()) + 1, far)
     if distance[-1] > CONFIG.max_length:
         length = f"is {distance[-1] / 1000:.0f} km long, must be at most {CONFIG.max_length / 1000:.0f} km"
         raise InputError(f"{columns.source}: {length}; are distances in m?")
-    heading, curvature = _course(columns, steps, distance)
-    grade = (0.0,) * len(distance)
+    heading, curvature = _course(values, distance, track)
+    grade = np.zeros(len(distance))
     if "altitude_m" in values:
-        grade = _slopes(distance, values["altitude_m"], distance, CONFIG.grade_length)
-    for row, sine in enumerate(grade):
-        if abs(sine) > CONFIG.max_grade:
-            wrong = f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are heights and distances in m?"
-            raise columns.error(row, wrong)
+        grade = _slopes(distance, np.array(values["altitude_m"]), distance, CONFIG.grade_length)
+    steepest = int(np.abs(grade).argmax())
+    if abs(grade[steepest]) > CONFIG.max_grade:
+        steep = f"altitude_m: a grade of {100 * grade[steepest]:.0f} % is no road's"
+        raise columns.error(steepest, f"{steep}; are heights and distances in m?")
     return Route(
         name,
-        distance,
-        grade,
-        curvature,
-        heading,
-        _speed_limits(columns),
+        tuple(distance.tolist()),
+        tuple(grade.tolist()),
+        tuple(curvature.tolist()),
+        tuple(heading.tolist()),
+        speed_limit,
         values.get("latitude_deg", ()),
         values.get("longitude_deg", ()),
         values.get("stop_s", ()),
@@ -181,79 +188,56 @@ def _with_filled_heights(columns: Columns) -> Columns:
     return replace(columns, values=columns.values | {"altitude_m": tuple(filled.tolist())})
 
 
-def _steps(columns: Columns) -> list[tuple[float, float]]:
-    """East and north [m] of each point from the one before; nothing without positions."""
-    given = [name for name in ("latitude_deg", "longitude_deg") if name in columns.values]
-    if not given:
-        return []
-    if len(given) == 1:
-        raise InputError(f"{columns.source}: has {given[0]} alone; latitude_deg and longitude_deg go together")
-    columns.check("latitude_deg", -89.0, 89.0, "deg")
-    columns.check("longitude_deg", -180.0, 360.0, "deg")
-    points = zip(columns.values["latitude_deg"], columns.values["longitude_deg"], strict=True)
-    steps = [east_north(start, end) for start, end in pairwise(points)]
-    for row, step in enumerate(steps, start=1):
-        if math.hypot(*step) < CONFIG.min_move:
-            raise columns.error(row, "latitude_deg, longitude_deg: the same position as before")
-    return steps
-
-
-def _distance(columns: Columns, steps: list[tuple[float, float]]) -> tuple[float, ...]:
-    """Distance [m] of each point from the first."""
+def _distance(columns: Columns) -> tuple[Array, Array | None]:
+    """Distance [m] of each point from the first, (n,), and where it is [m] east and north of it, (n, 2), if known."""
     import numpy as np
 
-    lengths = [math.hypot(*step) for step in steps]
+    track, lengths = None, np.zeros(0)
+    position = [name for name in ("latitude_deg", "longitude_deg") if name in columns.values]
+    if len(position) == 1:
+        raise InputError(f"{columns.source}: has {position[0]} alone; latitude_deg and longitude_deg go together")
+    if position:
+        points = zip(*(columns.values[name] for name in position), strict=True)
+        steps = [east_north(start, end) for start, end in pairwise(points)]
+        lengths = np.array([math.hypot(*step) for step in steps])
+        if lengths.min() < CONFIG.min_move:
+            raise columns.error(int(lengths.argmin()) + 1, "latitude_deg, longitude_deg: the same position as before")
+        track = np.concatenate(([(0.0, 0.0)], np.cumsum(steps, axis=0)))
     given = columns.values.get("distance_m")
-    if given is None and not steps:
-        raise InputError(f"{columns.source}: needs column distance_m, or latitude_deg and longitude_deg")
     if given is None:
-        return tuple(np.concatenate(([0.0], np.cumsum(lengths))).tolist())
+        if track is None:
+            raise InputError(f"{columns.source}: needs column distance_m, or latitude_deg and longitude_deg")
+        return np.concatenate(([0.0], np.cumsum(lengths))), track
     columns.check_increasing("distance_m", "m", CONFIG.min_step)
-    length = given[-1] - given[0]
-    if steps and not CONFIG.min_distance_ratio < sum(lengths) / length < CONFIG.max_distance_ratio:
-        wrong = f"distance_m covers {length:.0f} m, latitude_deg and longitude_deg {sum(lengths):.0f} m"
+    distance = np.array(given) - given[0]
+    way = lengths.sum()
+    if position and not CONFIG.min_distance_ratio < way / distance[-1] < CONFIG.max_distance_ratio:
+        wrong = f"distance_m covers {distance[-1]:.0f} m, latitude_deg and longitude_deg {way:.0f} m"
         raise InputError(f"{columns.source}: {wrong}; is distance_m in m?")
-    return tuple(d - given[0] for d in given)
+    return distance, track
 
 
-def _course(
-    columns: Columns, steps: list[tuple[float, float]], distance: tuple[float, ...]
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Heading [rad] and curvature [1/m] at each point, from positions or from the given curvature."""
+def _course(values: Mapping[str, tuple[float, ...]], distance: Array, track: Array | None) -> tuple[Array, Array]:
+    """Heading [rad] and curvature [1/m] at each point, (n,), from the track or from the given curvature."""
     import numpy as np
 
-    at = np.array(distance)
-    curvature = columns.values.get("curvature_1pm", (0.0,) * len(distance))
-    if not steps:
-        bends = np.array(curvature)
-        turned = np.cumsum(np.diff(at) * (bends[1:] + bends[:-1]) / 2)
-        return (0.0, *(-turned).tolist()), curvature
+    curvature = np.array(values.get("curvature_1pm", (0.0,) * len(distance)))
+    if track is None:
+        turned = np.cumsum(np.diff(distance) * (curvature[1:] + curvature[:-1]) / 2)
+        return np.concatenate(([0.0], -turned)), curvature
     ends = [0]
     for i, along in enumerate(distance):
         if along - distance[ends[-1]] >= CONFIG.min_chord:
             ends.append(i)
     ends = ends if len(ends) > 1 else [0, len(distance) - 1]
-    east, north = np.diff(np.concatenate(([(0.0, 0.0)], np.cumsum(steps, axis=0)))[ends], axis=0).T
-    headings, middles = np.unwrap(np.arctan2(east, north)), (at[ends][1:] + at[ends][:-1]) / 2
-    if "curvature_1pm" not in columns.values and len(middles) > 1:
-        curvature = tuple(-slope for slope in _slopes(middles, headings, at, CONFIG.curve_length))
-    return tuple(np.interp(at, middles, headings).tolist()), curvature
+    east, north = np.diff(track[ends], axis=0).T
+    headings, middles = np.unwrap(np.arctan2(east, north)), (distance[ends][1:] + distance[ends][:-1]) / 2
+    if "curvature_1pm" not in values and len(middles) > 1:
+        curvature = -_slopes(middles, headings, distance, CONFIG.curve_length)
+    return np.interp(distance, middles, headings), curvature
 
 
-def _speed_limits(columns: Columns) -> tuple[float, ...]:
-    given = [name for name in _LIMITS if name in columns.values]
-    if len(given) > 1:
-        raise InputError(f"{columns.source}: has {' and '.join(given)}; must have one speed limit")
-    if not given:
-        return (math.inf,) * len(columns)
-    name, factor = given[0], _LIMITS[given[0]]
-    columns.check(name, 0.1 / factor, 100.0 / factor, name.removeprefix("speed_limit_"))
-    return tuple(value * factor for value in columns.values[name])
-
-
-def _slopes(
-    x: tuple[float, ...] | Array, y: tuple[float, ...] | Array, at: tuple[float, ...] | Array, length: float
-) -> tuple[float, ...]:
+def _slopes(x: Array, y: Array, at: Array, length: float) -> Array:
     """Slope dy/dx, at each `at`, of the least-squares line through the points within `length` around it.
 
     At the ends the length is kept and lies to one side, so that noise is smoothed there as elsewhere; where points
@@ -261,15 +245,76 @@ def _slopes(
     """
     import numpy as np
 
-    xs, ys, where = np.asarray(x), np.asarray(y), np.asarray(at)
-    length = min(length, xs[-1] - xs[0])
-    start = np.clip(where - length / 2, xs[0], xs[-1] - length)
-    slack = 1e-9 * max(1.0, xs[-1])  # a grid's own points must not drop out by rounding
-    before = np.clip(np.searchsorted(xs, where, side="right") - 1, 0, len(xs) - 2)
-    first = np.minimum(np.searchsorted(xs, start - slack), before)
-    last = np.maximum(np.searchsorted(xs, start + length + slack, side="right"), before + 2)
+    length = min(length, x[-1] - x[0])
+    start = np.clip(at - length / 2, x[0], x[-1] - length)
+    slack = 1e-9 * max(1.0, x[-1])  # a grid's own points must not drop out by rounding
+    before = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    first = np.minimum(np.searchsorted(x, start - slack), before)
+    last = np.maximum(np.searchsorted(x, start + length + slack, side="right"), before + 2)
     slopes = []
     for i, j in zip(first.tolist(), last.tolist(), strict=True):
-        dx = xs[i:j] - xs[i:j].mean()
-        slopes.append(float(dx @ ys[i:j] / (dx @ dx)))
-    return tuple(slopes)
+        dx = x[i:j] - x[i:j].mean()
+        slopes.append(float(dx @ y[i:j] / (dx @ dx)))
+    return np.array(slopes)
+
+
+@dataclass(frozen=True)
+class SpeedProfile:
+    """Target `speed` [m/s] over `distance` [m] and the `time` [s] at which it is reached; tuples of one length.
+
+    Acceleration is constant between points. The ride begins and ends at standstill: a rider who follows speed over
+    distance must look a little ahead, or follow speed over time.
+    """
+
+    distance: tuple[float, ...]
+    speed: tuple[float, ...]
+    time: tuple[float, ...]
+
+    def speed_at(self, distance: float) -> float:
+        """Target speed [m/s] at `distance` [m]; 0 before the start and past the end."""
+        if not 0.0 <= distance <= self.distance[-1]:
+            return 0.0
+        i = min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1
+        part = (distance - self.distance[i]) / (self.distance[i + 1] - self.distance[i])
+        v0, v1 = self.speed[i], self.speed[i + 1]
+        return math.sqrt(v0 * v0 + part * (v1 * v1 - v0 * v0))
+
+
+def speed_profile(
+    route: Route,
+    *,
+    lateral_acceleration: float = 2.5,
+    acceleration: float = 1.2,
+    deceleration: float = 1.5,
+    top_speed: float = math.inf,
+) -> SpeedProfile:
+    """The fastest ride of `route`, from standstill to standstill, within its limits and the rider's.
+
+    At the route's stops it comes to a halt, for no time. Speed stays within the speed limit, `top_speed` [m/s] and
+    √(lateral_acceleration/|curvature|), everywhere and not only at points; it rises and falls with at most
+    `acceleration` and `deceleration` (all in m/s²). Points are the route's and others between them.
+    """
+    distance = [0.0]
+    curve: list[float] = [abs(route.curvature[0])]
+    limit: list[float] = []  # square of the speed allowed in each interval
+    for i, (d0, d1) in enumerate(pairwise(route.distance)):
+        # Two at least: one interval would be standstill throughout.
+        pieces = max(2, math.ceil((d1 - d0) / CONFIG.profile_step))
+        fixed = min(route.speed_limit[i], top_speed) ** 2
+        for k in range(1, pieces + 1):
+            part = k / pieces
+            distance.append(d0 + part * (d1 - d0) if k < pieces else d1)
+            curve.append(abs(route.curvature[i] + part * (route.curvature[i + 1] - route.curvature[i])))
+            sharpest = max(curve[-2:])
+            limit.append(min(fixed, lateral_acceleration / sharpest if sharpest > 0 else math.inf))
+    square = [0.0, *(min(pair) for pair in pairwise(limit)), 0.0]
+    stops = {d for d, stop in zip(route.distance, route.stop, strict=False) if stop > 0}
+    square = [0.0 if d in stops else v2 for d, v2 in zip(distance, square, strict=True)]
+    lengths = [d1 - d0 for d0, d1 in pairwise(distance)]
+    for i, length in enumerate(lengths):
+        square[i + 1] = min(square[i + 1], square[i] + 2 * acceleration * length)
+    for i, length in reversed(list(enumerate(lengths))):
+        square[i] = min(square[i], square[i + 1] + 2 * deceleration * length)
+    speed = [math.sqrt(v2) for v2 in square]
+    durations = (2 * length / (v0 + v1) for length, (v0, v1) in zip(lengths, pairwise(speed), strict=True))
+    return SpeedProfile(tuple(distance), tuple(speed), tuple(accumulate(durations, initial=0.0)))

@@ -11,8 +11,7 @@ from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
-from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import Route, read_route
+from gz_onboard.routes.route import Route, read_route, speed_profile
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts.chassis import MODELS
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight

@@ -9,8 +9,7 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.routes.columns import MAX_BYTES
-from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import CONFIG, read_route, read_route_columns
+from gz_onboard.routes.route import CONFIG, read_route, read_route_columns, speed_profile
 
 HEAD = '<?xml version="1.0"?>\n<gpx xmlns="http://www.topografix.com/GPX/1/1">\n'
 
@@ -149,7 +148,7 @@ def test_what_is_no_gpx_is_refused(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 kmh is outside"),
+        ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 km/h is outside"),
         ("distance_m,headwind_mps\n0,20\n20,293\n", r":3: headwind_mps: 293 m/s is outside"),
         ("distance_m,stop\n0,20\n20,293\n", r":1: unknown column 'stop' \(did you mean 'stop_s'\?\)"),
         ("distance_m\n" + "".join(f"{4000 * i}\n" for i in range(252)), r"is 1004 km long, must be at most 1000"),

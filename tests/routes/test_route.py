@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.routes.profile import speed_profile
-from gz_onboard.routes.route import Route, read_route
+from gz_onboard.routes.route import Route, read_route, speed_profile
 
 METRES_NORTH = 111_035.0  # of a degree at 40.3° on WGS 84, and of one east:
 METRES_EAST = 85_010.0
@@ -144,8 +143,8 @@ def test_distance_begins_with_zero_and_limits_are_in_metres_per_second(tmp_path)
         ("distance_m,altitude_m\n0,0\n20,nan\n", r":3: altitude_m: must be a finite number"),
         ("distance_m,altitude_m\n0,0\n20,99999\n", r":3: altitude_m: 99999 m is outside -500 to 9000 m"),
         ("distance_m,altitude_m\n0,0\n0.02,1\n0.04,2\n", r":2: altitude_m: a grade of 5000 % is no road's"),
-        ("distance_m,altitude_m,speed_limit_kmh\n0,0,30\n20,0,0\n", r":3: speed_limit_kmh: 0 kmh is outside"),
-        ("distance_m,altitude_m,speed_limit_mps\n0,0,30\n20,0,130\n", r":3: speed_limit_mps: 130 mps is outside"),
+        ("distance_m,altitude_m,speed_limit_kmh\n0,0,30\n20,0,0\n", r":3: speed_limit_kmh: 0 km/h is outside"),
+        ("distance_m,altitude_m,speed_limit_mps\n0,0,30\n20,0,130\n", r":3: speed_limit_mps: 130 m/s is outside"),
         ("distance_m,altitude_m,speed_limit_mps,speed_limit_kmh\n0,0,3,3\n9,0,3,3\n", "must have one speed limit"),
         ("distance_m,altitude_m,curvature_1pm\n0,0,0\n20,0,50\n", r":3: curvature_1pm: 50 1/m is outside"),
         (POSITIONS + "\n91,0,0\n92,0,0\n", r":2: latitude_deg: 91 deg is outside"),
