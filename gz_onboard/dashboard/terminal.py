@@ -10,7 +10,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import TextIO
 
@@ -22,18 +22,19 @@ from gz_onboard.events import KEEPING, NO_SENSOR, Reason, cause_words, words
 
 REDRAW_S, LINE_S = 0.2, 0.95  # at least, between two screens, and two lines
 ONCE_WITHIN_S = 5.0  # that --once waits for every message
-LABEL, WIDEST = 20, 78  # columns: of the labels, and of the whole
+INDENT, WIDEST = 20, 78  # columns: before the texts, and of the whole
 ROUND = 1, 1.5, 2, 3, 4, 5, 6, 8, 10
 """First digits of the end of a scale."""
 
-Line = list[tuple[str, str]]
-"""Texts, each with ANSI codes or nothing; without colour the texts themselves say everything."""
+Line = tuple[str, str, str]
+"""Label, text, and ANSI codes of the text; without colour the text itself says everything."""
 
-_BOLD, _DIM, _RED, _GREEN, _YELLOW, _CYAN = "1", "2", "31", "32", "33", "36"
+_EMPTY: Line = "", "", ""
+_PLAIN, _BOLD, _DIM, _RED, _YELLOW = "0", "1", "2", "31", "33"
 _STATES = {
     None: (_DIM, "unknown"),
-    "starting": (_CYAN, "starting: no estimate yet"),
-    "valid": (_GREEN, "valid"),
+    "starting": ("36", "starting: no estimate yet"),
+    "valid": ("32", "valid"),
     "degraded": (_YELLOW, "degraded: an input is missing or doubtful, wider interval"),
     "invalid": (_RED, "invalid: range unavailable"),
 }
@@ -71,7 +72,7 @@ def show(view: View, arguments: argparse.Namespace) -> int:
     if picture and (arguments.once or on_screen):  # the last picture stays
         columns = shutil.get_terminal_size().columns
         for line in screen(picture, columns, view.comments):
-            print(rendered(line, columns, colour).rstrip(), file=out)
+            print(rendered(line, columns, colour), file=out)
         out.flush()
     return FAILED if arguments.once and not (picture and picture["heard"]) else OK
 
@@ -89,123 +90,96 @@ def _other_screen(out: TextIO) -> Iterator[None]:
 
 def screen(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Line]:
     """Lay out the whole picture for a terminal of `width` columns. comments: of the DBC file, by signal."""
-    width = max(min(width, WIDEST), LABEL + 4)
+    width = max(min(width, WIDEST), INDENT + 4)
+    late, ranges, battery, used = picture["late"], picture["range"], picture["battery"], picture["consumption"]
     colour, state = _STATES[picture["state"]]
-    late, stale, ranges, battery = picture["late"], picture["stale"], picture["range"], picture["battery"]
-    waiting = "waiting" in picture["alerts"]
-
-    def number(value: float | None, form: str, unit: str, message: str, codes: str = _BOLD) -> tuple[str, str]:
-        return _text(value, form, unit), _DIM if message in late else codes
-
-    energy = "RANGE_Energy"
-    remaining = number(ranges["km"], ".1f", "km", "RANGE_Estimate", f"{_BOLD};{colour}")
-    p10, p90 = (number(ranges[key], ".1f", "km", "RANGE_Estimate") for key in ("p10_km", "p90_km"))
-    expected, recent = (
-        number(picture["consumption"][f"{key}_wh_per_km"], ".1f", "Wh/km", energy) for key in ("expected", "recent")
-    )
+    if waiting := "waiting" in picture["alerts"]:
+        state = "waiting for the scooter"
+    km, p10, p90 = (_text(ranges[key], ".1f", "km") for key in ("km", "p10_km", "p90_km"))
     soc, sigma = battery["soc_percent"], battery["soc_sigma_percent"]
-    charge = "–" if soc is None else f"{soc:.1f} %" if sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
-    low = soc is not None and soc <= NEARLY_EMPTY
-    lines: list[Line] = [
-        [(" gz-onboard", _BOLD), (f" · {picture['channel']} ({picture['interface']})", _DIM)],
-        [],
-        _row("Range", remaining, ("     80 %: ", _DIM), p10, (" to ", _DIM), p90),
-        *_band(ranges, width, _DIM if "RANGE_Estimate" in late else colour),
-        [],
-        _row("State of charge", (charge, _DIM if "RANGE_Status" in late else f"{_BOLD};{_RED}" if low else _BOLD)),
-        _row("Energy left", number(battery["energy_left_wh"], ".0f", "Wh", energy)),
-        _row("Consumption", expected, (" expected, ", ""), recent, (" over the last km", "")),
+    charged = _text(soc, ".1f", "%") if sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
+    expected, recent = (_text(used[key], ".1f", "Wh/km") for key in ("expected_wh_per_km", "recent_wh_per_km"))
+    source = f"{picture['channel']} ({picture['interface']}){'' if picture['bus_up'] else ' is down'}"
+    red = soc is not None and soc <= NEARLY_EMPTY
+
+    def of_message(message: str, label: str, text: str, codes: str = _BOLD) -> Line:
+        return label, text, _DIM if message in late else codes
+
+    lines = [
+        ("gz-onboard", source, _DIM),
+        _EMPTY,
+        of_message("RANGE_Estimate", "Range", f"{km}     80 %: {p10} to {p90}", f"{_BOLD};{colour}"),
+        *(of_message("RANGE_Estimate", "", text, colour) for text in _band(ranges, width - INDENT)),
+        _EMPTY,
+        of_message("RANGE_Status", "State of charge", charged, f"{_BOLD};{_RED}" if red else _BOLD),
+        of_message("RANGE_Energy", "Energy left", _text(battery["energy_left_wh"], ".0f", "Wh")),
+        of_message("RANGE_Energy", "Consumption", f"{expected} expected, {recent} over the last km"),
     ]
-    if not picture["bus_up"]:
-        lines[0].append((" is down", _DIM))
     if picture["causes"]:
         why = ", ".join(f"{cause_words(one['cause'])} {one['km']:+.1f} km" for one in picture["causes"])
-        lines.append(_row("Why", (why, _DIM if "RANGE_Why" in late else "")))
-        lines.append(_row("", (f"besides the charge; rated {_text(picture['rated_km'], '.1f', 'km')}", _DIM)))
-    lines.append([])
-    lines.append(_row("State", ("waiting for the scooter", _BOLD) if waiting else (state, f"{_BOLD};{colour}")))
+        lines.append(of_message("RANGE_Why", "Why", why, _PLAIN))
+        lines.append(("", f"besides the charge; rated {_text(picture['rated_km'], '.1f', 'km')}", _DIM))
+    lines += [_EMPTY, ("State", state, f"{_BOLD};{colour}")]
     if picture["activity"]:
-        lines.append(_row("Activity", (picture["activity"], "")))
-    if picture["charge"]:
-        lines.append(_row("Charge", (_charge(picture["charge"]), "")))
-    lines += _reasons(picture, width, comments)
-    for i, text in enumerate(textwrap.wrap(", ".join(map(words, picture["distrusted"])), width - LABEL)):
-        lines.append(_row("" if i else "Sensors left out", (text, _YELLOW)))
-    if not picture["heard"]:
-        lines.append(_row("No frame of", (picture["file"], _RED)))
-        lines.append(_row("", ("Is the daemon on this bus? Is --dbc its range_dbc?", _DIM)))
+        lines.append(("Activity", picture["activity"], _PLAIN))
+    if charge := picture["charge"]:
+        power, full = _text(charge["power_w"], ".0f", "W"), _text(charge["range_full_km"], ".1f", "km")
+        hours, minutes = divmod(round(charge["time_to_full_min"] or 0), 60)
+        soon = "" if charge["time_to_full_min"] is None else f", full in {hours} h {minutes:02d} min, {full} then"
+        lines.append(("Charge", f"{power}{soon}", _PLAIN))
+    found = Reason(sum(Reason[name.upper()] for name in picture["reasons"]))
+    because = found & ~KEEPING & ~(NO_SENSOR if waiting else Reason(0))  # a scooter that is off has no sensors
+    for label, group in (
+        ("Wider interval" if picture["state"] == "valid" else "Because", because),
+        ("Note", found & KEEPING),
+    ):
+        said = [(words(str(reason.name)), comments[reason_signal(reason)].rstrip(".")) for reason in group]
+        fits = [f"{name}: {comment}" if INDENT + 4 + len(name + comment) <= width else name for name, comment in said]
+        lines += _list(label, fits, _YELLOW)
+    left_out = ", ".join(map(words, picture["distrusted"]))
+    lines += _list("Sensors left out", textwrap.wrap(left_out, width - INDENT), _YELLOW)
+    if picture["heard"]:
+        lines += _list("Stale", picture["stale"], _RED)
     else:
-        lines += [_row("" if i else "Stale", (name, _RED)) for i, name in enumerate(stale)]
-    return [*lines, [], *_counts(picture)]
+        lines.append(("No frame of", picture["file"], _RED))
+        lines.append(("", "Is the daemon on this bus? Is --dbc its range_dbc?", _DIM))
+    age, counts = picture["age_s"], picture["counts"]
+    last = "none yet" if age is None else f"{age:.1f} s old" if age < 100 else f"{age / 60:.0f} min old"
+    own = ", ".join(f"{count} {name}" for name, count in counts.items())
+    known = [f"{count:.0f} {name}" for name, count in picture["vehicle_counts"].items() if count is not None]
+    lines += [_EMPTY, ("Range frames", f"{last}, {own}", _RED if counts["bad"] else _DIM)]
+    return [*lines, ("Vehicle's frames", ", ".join(known) or "–", _DIM)]
 
 
 def rendered(line: Line, width: int, colour: bool) -> str:
-    """Turn a line into text for the terminal, at most `width` columns wide."""
-    result, room = "", min(width, WIDEST)
-    for text, codes in line:
-        shown = text if len(text) <= room else text[: max(room - 1, 0)] + "…"[:room]
-        room -= len(shown)
-        result += f"\x1b[{codes}m{shown}\x1b[0m" if colour and codes and shown else shown
-    return result
-
-
-def _row(label: str, *texts: tuple[str, str], codes: str = "") -> Line:
-    return [(f"  {label:{LABEL - 2}}", codes), *texts]
+    """Turn a line into text for the terminal, at most `width` columns wide; one that is cut ends in …."""
+    label, text, codes = line
+    whole, room = f"  {label:{INDENT - 2}}{text}", min(width, WIDEST)
+    if len(whole) > room:
+        whole = whole[: room - 1] + "…"
+    return f"{whole[:INDENT]}\x1b[{codes}m{whole[INDENT:]}\x1b[0m" if colour and text else whole.rstrip()
 
 
 def _text(value: float | None, form: str, unit: str) -> str:
     return "–" if value is None else f"{value:{form}} {unit}"
 
 
-def _charge(charge: Mapping[str, float | None]) -> str:
-    power, minutes = _text(charge["power_w"], ".0f", "W"), charge["time_to_full_min"]
-    if minutes is None:
-        return power
-    hours, rest = divmod(round(minutes), 60)
-    time = f"{hours} h {rest:02d} min" if hours else f"{rest} min"
-    return f"{power}, full in {time}, {_text(charge['range_full_km'], '.1f', 'km')} then"
+def _list(label: str, texts: Sequence[str], codes: str) -> list[Line]:
+    return [("" if i else label, text, codes) for i, text in enumerate(texts)]
 
 
-def _reasons(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Line]:
-    """The reasons, with the comments of the DBC file where there is room; while waiting, not the silent sensors."""
-    found = Reason(sum(Reason[name.upper()] for name in picture["reasons"]))
-    label = "Wider interval" if picture["state"] == "valid" else "Because"
-    hidden = NO_SENSOR if "waiting" in picture["alerts"] else Reason(0)
-    lines = []
-    for title, group in (label, found & ~KEEPING & ~hidden), ("Note", found & KEEPING):
-        for i, reason in enumerate(group):
-            name, comment = words(str(reason.name)), comments.get(reason_signal(reason), "").rstrip(".")
-            fits = comment and len(name) + len(comment) + LABEL + 4 <= width
-            lines.append(_row("" if i else title, (name, _YELLOW), (f": {comment}" if fits else "", _DIM)))
-    return lines
-
-
-def _band(ranges: Mapping[str, float | None], width: int, colour: str) -> list[Line]:
-    """A bar from P10 to P90 on a scale from 0 km, with the range as a dot."""
-    cells = width - 4
+def _band(ranges: Mapping[str, float | None], cells: int) -> tuple[str, str]:
+    """A bar from P10 to P90 with the range as a dot, and below it the scale from 0 km."""
     p10, km, p90 = ranges["p10_km"], ranges["km"], ranges["p90_km"]
     if p10 is None or km is None or p90 is None:
-        return [[("  " + "─" * cells, _DIM)], []]
+        return "─" * cells, ""
     top = scale_end(p90)
     first, dot, last = (min(round(value / top * (cells - 1)), cells - 1) for value in (p10, km, p90))
-    bar = [("  " + "─" * first, _DIM), ("━" * (dot - first), colour), ("●", f"{_BOLD};{colour}")]
-    bar += [("━" * (last - dot), colour), ("─" * (cells - 1 - last), _DIM)]
-    return [bar, [("  0" + f"{top:g} km".rjust(cells - 1), _DIM)]]
+    bar = "─" * first + "━" * (dot - first) + "●" + "━" * (last - dot) + "─" * (cells - 1 - last)
+    return bar, "0" + f"{top:g} km".rjust(cells - 1)
 
 
 def scale_end(value: float) -> float:
     """The next round number from `value` on, at least 1."""
     size = 10.0 ** math.floor(math.log10(max(value, 1.0)))
     return next(step * size for step in ROUND if step * size >= value)
-
-
-def _counts(picture: Picture) -> list[Line]:
-    age, counts = picture["age_s"], picture["counts"]
-    last = "none yet" if age is None else f"{age:.1f} s old" if age < 100 else f"{age / 60:.0f} min old"
-    own = f"{last}, {counts['received']} received, {counts['lost']} lost"
-    named = {"unknown": "unknown identifiers"}
-    known = [f"{n:.0f} {named.get(key, key)}" for key, n in picture["vehicle_counts"].items() if n is not None]
-    return [
-        _row("Range frames", (own, _DIM), (f", {counts['bad']} bad", _RED if counts["bad"] else _DIM), codes=_DIM),
-        _row("Vehicle's frames", (", ".join(known) or "–", _DIM), codes=_DIM),
-    ]

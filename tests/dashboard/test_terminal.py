@@ -123,10 +123,10 @@ def test_a_scooter_that_is_not_on_is_waited_for():
 
 
 def test_the_bar_stands_where_the_numbers_are():
-    bar = next(line for line in drawn(seen(), 100.0, 54).splitlines() if "●" in line)
-    assert len(bar) == 52
+    bar = next(line for line in drawn(seen(), 100.0, 78).splitlines() if "●" in line)
+    assert len(bar) == 78
     for mark, km in (bar.index("━"), 26.54), (bar.index("●"), 34.21), (bar.rindex("━"), 44.34):
-        assert (mark - 2) / 49 * 50 == pytest.approx(km, abs=1.1)
+        assert (mark - 20) / 57 * 50 == pytest.approx(km, abs=1.1)
 
 
 def test_an_old_number_is_never_shown_as_if_fresh():
