@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -141,3 +142,13 @@ def add_shared(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> 
     for name in names:
         text, about = _SHARED[name]
         parser.add_argument(name, **{"help": text, **about, **changes})
+
+
+def host_and_port(text: str, port: int | None = None) -> tuple[str, int]:
+    """Split ``HOST:PORT`` or ``[::1]:PORT``; with a default `port` also a host alone. InputError for anything else."""
+    found = re.fullmatch(r"(\[[\w:.%]+\]|[^:\s/@]+)(?::(\d{1,5}))?", text, re.ASCII)
+    number = int(found[2] or port or 0) if found and (found[2] or port) else -1
+    if not found or not (0 if port is None else 1) <= number < 1 << 16:
+        form = "ADDRESS:PORT" if port is None else "HOST or HOST:PORT"
+        raise InputError(f"{text}: must be {form}, such as 127.0.0.1:8000 or [::1]:8000")
+    return found[1].strip("[]"), number

@@ -17,8 +17,8 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from gz_onboard.dashboard.live import host_and_port
 from gz_onboard.errors import InputError
+from gz_onboard.options import host_and_port
 from gz_onboard.toml import Table
 
 KEEP_ALIVE_S = 10  # after one and a half of it the broker publishes the last will
@@ -28,6 +28,7 @@ GOODBYE_S = 2.0  # for the last message
 PORT, TLS_PORT = 1883, 8883
 USER, PASSWORD = "GZ_ONBOARD_MQTT_USER", "GZ_ONBOARD_MQTT_PASSWORD"
 
+Message = tuple[str, bytes]
 Login = tuple[str | None, str | None]
 """User and password, or neither."""
 
@@ -51,25 +52,25 @@ def read_login(file: Path | None, environ: Mapping[str, str] = os.environ) -> Lo
 class Broker:
     """The connection to the broker at `address`, ``HOST[:PORT]``.
 
-    will: (topic, payload) that the broker publishes once we are gone; report: gets messages for people; tls: a file of
-    certificates to trust, "" for the system's, None for no encryption. `connections` counts them. InputError for an
-    address or certificates that cannot be used.
+    hello, will: (topic, payload) that is published with each connection, and that the broker publishes once we are
+    gone; report: gets messages for people; tls: a file of certificates to trust, "" for the system's, None for no
+    encryption. InputError for an address or certificates that cannot be used.
     """
 
     def __init__(
         self,
         address: str,
         name: str,
-        will: tuple[str, bytes],
+        hello: Message,
+        will: Message,
         report: Callable[[str], None],
         *,
         tls: str | None = None,
         login: Login = (None, None),
     ) -> None:
         self.address = host_and_port(address, PORT if tls is None else TLS_PORT)
-        self.connections = 0
         self.connected = False
-        self._will, self._report, self._reported = will, report, ""
+        self._hello, self._will, self._report, self._reported = hello, will, report, ""
         client = Client(CallbackAPIVersion.VERSION2, f"gz-onboard-{name}", protocol=MQTTProtocolVersion.MQTTv5)
         client.will_set(*will, qos=1, retain=True)
         client.reconnect_delay_set(*RETRY_S)
@@ -121,7 +122,7 @@ class Broker:
             self._say(f"{self} refuses us: {reason}; trying again")
             return
         self.connected = True
-        self.connections += 1
+        self.publish(*self._hello)  # the broker may have lost everything
         self._say(f"connected to {self}")
 
     def _on_connect_fail(self, _client: Client, _data: Any) -> None:

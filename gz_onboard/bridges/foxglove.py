@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from gz_onboard.constants import WH
-from gz_onboard.dashboard.live import add_source, host_and_port, live, report, view_of
+from gz_onboard.dashboard.command import add_source, live, report, view_of
 from gz_onboard.dashboard.vehicle_frames import POSITION_ROLES
 from gz_onboard.dashboard.view import Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError, writing
@@ -22,6 +22,7 @@ from gz_onboard.log_rows import (
     estimate_schema,
     location_row,
 )
+from gz_onboard.options import host_and_port
 from gz_onboard.vehicle import read_vehicle
 
 LISTEN = "127.0.0.1:8765"

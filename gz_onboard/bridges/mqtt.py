@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard import __version__
-from gz_onboard.dashboard.live import add_source, live, report, view_of
+from gz_onboard.dashboard.command import add_source, live, report, view_of
 from gz_onboard.dashboard.view import ALERTS, Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError
 from gz_onboard.events import Activity, State
@@ -109,18 +109,18 @@ def run(arguments: argparse.Namespace) -> int:
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
         raise InputError(f"--name {name}: must be of letters, digits, - and _, at most 64")
     topic, login = topic_of(name), read_login(arguments.login)
+    hello = f"{PREFIX}/device/gz-onboard-{name}/config", encoded(discovery(name))
     will = topic, encoded({"status": "offline"} | dict.fromkeys(SENSORS))
-    broker = Broker(arguments.broker, name, will, partial(report, "mqtt"), tls=arguments.tls, login=login)
+    broker = Broker(arguments.broker, name, hello, will, partial(report, "mqtt"), tls=arguments.tls, login=login)
+    sent, sent_at = None, -math.inf
     with live(view_of(arguments, own_frames=True), arguments) as pictures, closing(broker):
         broker.start()
         notify(READY=1, STATUS=f"{arguments.channel} ({arguments.interface}) to {broker} as {name}")
-        announced, sent, sent_at = 0, None, -math.inf
         for picture in pictures:
-            now, connections, state = time.monotonic(), broker.connections, state_of(picture)
-            if announced != connections:  # the broker may have lost everything
-                about = encoded(discovery(name))
-                if broker.publish(f"{PREFIX}/device/gz-onboard-{name}/config", about):
-                    announced, sent_at = connections, -math.inf
+            now, state = time.monotonic(), state_of(picture)
+            if not broker.connected:
+                sent_at = -math.inf
+                continue
             due = now - sent_at >= (AT_LEAST_S if state == sent else EVERY_S)
             if due and broker.publish(topic, encoded(state), EXPIRES_S):
                 sent, sent_at = state, now

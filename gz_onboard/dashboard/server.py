@@ -22,8 +22,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from gz_onboard import __version__
-from gz_onboard.dashboard.live import host_and_port
 from gz_onboard.errors import InputError
+from gz_onboard.options import host_and_port
 
 STATIC = Path(__file__).with_name("static")
 TYPES = {
@@ -47,13 +47,12 @@ HEADERS = {
 
 
 class Feed:
-    """The newest picture, encoded, for all connections."""
+    """The newest picture, encoded, for all connections; an empty one ends them."""
 
     def __init__(self) -> None:
         self._number = 0
         self._data = b""
         self._time = -math.inf  # s, monotonic
-        self._closed = False
         self._changed = threading.Condition()
 
     def publish(self, data: bytes) -> None:
@@ -62,21 +61,14 @@ class Feed:
             self._data, self._number, self._time = data, self._number + 1, time.monotonic()
             self._changed.notify_all()
 
-    def close(self) -> None:
-        """Release all waiting readers."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    def after(self, number: int, timeout: float | None = None) -> tuple[int, bytes] | None:
-        """Wait for a picture newer than `number` that is not old; return its number and it, or None if none comes."""
+    def after(self, number: int, timeout: float | None = None) -> tuple[int, bytes]:
+        """Wait for a picture newer than `number` that is not old; return its number and it, empty if none comes."""
 
         def is_new() -> bool:
             return self._number > number and time.monotonic() - self._time <= OLDEST_S
 
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or is_new(), timeout)
-            return (self._number, self._data) if is_new() and not self._closed else None
+            return (self._number, self._data) if self._changed.wait_for(is_new, timeout) else (number, b"")
 
 
 class Server(socketserver.ThreadingTCPServer):
@@ -125,8 +117,8 @@ class Handler(BaseHTTPRequestHandler):
         elif path == "/api/stream":
             self._stream()
         elif path == "/api/latest":
-            if found := server.feed.after(0, OLDEST_S):
-                self._answer(HTTPStatus.OK, found[1] + b"\n", "application/json")
+            if picture := server.feed.after(0, OLDEST_S)[1]:
+                self._answer(HTTPStatus.OK, picture + b"\n", "application/json")
             else:
                 self._answer(HTTPStatus.SERVICE_UNAVAILABLE, b"There is no current picture.\n")
         elif path in server.files:
@@ -139,10 +131,10 @@ class Handler(BaseHTTPRequestHandler):
         """Send `build` once, then a picture when it changes and every second, until the browser goes away."""
         build = f"retry: {RETRY_MS}\nevent: build\ndata: {__version__}\n\n"
         self._answer(HTTPStatus.OK, build.encode(), "text/event-stream")
-        number = 0
-        while found := self.server.feed.after(number):
-            number, data = found
-            self.wfile.write(b"data: " + data + b"\n\n")
+        number, picture = self.server.feed.after(0)
+        while picture:
+            self.wfile.write(b"data: " + picture + b"\n\n")
+            number, picture = self.server.feed.after(number)
 
     def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
         self.send_response(status)
@@ -177,6 +169,6 @@ def served(feed: Feed, listen: str) -> Iterator[str]:
     try:
         yield server.url
     finally:
-        feed.close()
+        feed.publish(b"")
         server.shutdown()
         server.server_close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import shutil
@@ -15,13 +14,11 @@ from contextlib import contextmanager, nullcontext
 from typing import TextIO
 
 from gz_onboard.bus.publisher import reason_signal
-from gz_onboard.dashboard.live import live
-from gz_onboard.dashboard.view import NEARLY_EMPTY, Picture, View, encoded
+from gz_onboard.dashboard.view import NEARLY_EMPTY, Picture, encoded
 from gz_onboard.errors import FAILED, OK, InputError
 from gz_onboard.events import KEEPING, NO_SENSOR, Reason, cause_words, words
 
 REDRAW_S, LINE_S = 0.2, 0.95  # at least, between two screens, and two lines
-ONCE_WITHIN_S = 5.0  # that --once waits for every message
 INDENT, WIDEST = 20, 78  # columns: before the texts, and of the whole
 ROUND = 1, 1.5, 2, 3, 4, 5, 6, 8, 10
 """First digits of the end of a scale."""
@@ -40,41 +37,42 @@ _STATES = {
 }
 
 
-def show(view: View, arguments: argparse.Namespace) -> int:
-    """Show `view` of the bus of the options; return the exit status: with --once 1 if no range frame came at all."""
+def show(pictures: Iterator[Picture], comments: Mapping[str, str], once: bool) -> int:
+    """Show pictures as they come, or `once` the first that is whole; return the exit status.
+
+    comments: of the DBC file, by signal. The status is that of a failure if no range frame came for the one picture.
+    """
     out: TextIO | None = sys.stdout
     if out is None:  # closed by the caller
         raise InputError("there is no standard output to show anything on")
     in_front = threading.current_thread() is threading.main_thread()
     terminal = in_front and out.isatty() and os.environ.get("TERM", "dumb") != "dumb"
-    colour, on_screen = terminal and "NO_COLOR" not in os.environ, terminal and not arguments.once
-    if arguments.once:
-        arguments.duration = arguments.duration or ONCE_WITHIN_S
+    colour, on_screen = terminal and "NO_COLOR" not in os.environ, terminal and not once
     picture, drawn = None, -math.inf
-    with live(view, arguments) as pictures, _other_screen(out) if on_screen else nullcontext():
+    with _other_screen(out) if on_screen else nullcontext():
         for picture in pictures:
             now = time.monotonic()
-            if arguments.once and not picture["stale"]:
+            if once and not picture["stale"]:
                 break
-            if arguments.once or now - drawn < (REDRAW_S if on_screen else LINE_S):
+            if once or now - drawn < (REDRAW_S if on_screen else LINE_S):
                 continue
             drawn = now
             if not on_screen:
                 print(encoded(picture).decode(), file=out, flush=True)
                 continue
             size = shutil.get_terminal_size()
-            lines = screen(picture, size.columns, view.comments)[: size.lines]
+            lines = screen(picture, size.columns, comments)[: size.lines]
             # Over the old picture, not after clearing the screen: no flicker. Each line is cleared before it is
             # written; after one that is as wide as the terminal, clearing would remove its last letter.
             text = "\r\n".join(f"\x1b[K{rendered(line, size.columns, colour)}" for line in lines)
             out.write(f"\x1b[H{text}" + ("\r\n\x1b[J" if len(lines) < size.lines else ""))
             out.flush()
-    if picture and (arguments.once or on_screen):  # the last picture stays
+    if picture and (once or on_screen):  # the last picture stays
         columns = shutil.get_terminal_size().columns
-        for line in screen(picture, columns, view.comments):
+        for line in screen(picture, columns, comments):
             print(rendered(line, columns, colour), file=out)
         out.flush()
-    return FAILED if arguments.once and not (picture and picture["heard"]) else OK
+    return FAILED if once and not (picture and picture["heard"]) else OK
 
 
 @contextmanager

@@ -68,7 +68,6 @@ class VehicleFrames:
         }
         self._latest: dict[str, tuple[float, float, int]] = {}  # by role: value, when it came [s], its stamp [ns]
         self._day = Day(day_file, vehicle.name)
-        self._positions = positions
         riding = cell_limits(vehicle.derating)
         self.riding_limits = riding  # degC, of the cells
         self.charging_limits = max(riding[0], CHARGING_DEGC[0]), min(riding[1], CHARGING_DEGC[1])
@@ -101,7 +100,7 @@ class VehicleFrames:
             "odometer_km": None if metres is None else round(metres / 1e3, 1),
             "ridden_today_km": None if metres is None else self._day.ridden_km,
         }
-        return shown | {"position": self._position(fresh)} if self._positions else shown
+        return shown | {"position": self._position(fresh)} if "longitude" in self._period else shown
 
     def _position(self, fresh: dict[str, float]) -> dict[str, Any] | None:
         """Where the vehicle is, and the time stamp [ns] of the longitude; None without a fix."""

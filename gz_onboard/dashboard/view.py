@@ -72,8 +72,7 @@ class ReceivedMessage:
         self._definition = definition
         self._limits = {s.name: raw_range(s, not_available=True) for s in signals}
         self._scales = {s.name: (float(s.conversion.scale), float(s.conversion.offset)) for s in signals}
-        self._counter: int | None = None
-        self._counts = int(self._limits[f"{name}Counter"][1]) + 1
+        self._counter = 0
 
     def periods_old(self, now: float) -> float:
         """The age of its values at `now` [s], in periods."""
@@ -87,8 +86,8 @@ class ReceivedMessage:
             return
         raw: dict[str, Any] = message.decode_simple(data, decode_choices=False, scaling=False)
         counter = int(raw[f"{message.name}Counter"])
-        if self._counter is not None and self.periods_old(now) <= STALE_PERIODS:
-            step = (counter - self._counter) % self._counts
+        if self.periods_old(now) <= STALE_PERIODS:
+            step = (counter - self._counter) % (int(self._limits[f"{message.name}Counter"][1]) + 1)
             if step == 0:  # a repeated frame: the sender may hang
                 self.bad += 1
                 return
@@ -271,7 +270,5 @@ def encoded(values: Mapping[str, object]) -> bytes:
 
 def value_at(picture: Picture, path: str) -> Any:
     """The value at `path`, such as ``route.left_km``; None if the part is not there."""
-    found: Any = picture
-    for key in path.split("."):
-        found = None if found is None else found[key]
-    return found
+    part, _, key = path.partition(".")
+    return (picture[part] or {}).get(key) if key else picture[part]

@@ -41,12 +41,10 @@ class RouteFileConfig:
     max_points: int = 50_000  # 1000 km at 20 m
     max_length: float = 1e6  # reading a longer route takes more than 70 MB
     max_gap: float = 5000.0  # points farther apart are places on the way, not the road
-    min_altitude: float = -500.0
-    max_altitude: float = 9000.0
+    altitude: tuple[float, float] = (-500.0, 9000.0)
     profile_step: float = 5.0  # at most, between points of a speed profile
     near_zero: float = 20.0  # a road at sea level has heights within; on any other a height of 0 is a missing one
-    min_distance_ratio: float = 0.5  # of the positions' length over distance_m
-    max_distance_ratio: float = 1.2
+    distance_ratio: tuple[float, float] = (0.5, 1.2)  # of the positions' length over distance_m
 
 
 CONFIG = RouteFileConfig()
@@ -54,7 +52,7 @@ SPEED_LIMITS = {f"speed_limit_{unit}": METRES_PER_SECOND[unit] for unit in ("mps
 LIMITS = {  # of a column: least, most, unit
     "latitude_deg": (-89.0, 89.0, "deg"),
     "longitude_deg": (-180.0, 360.0, "deg"),
-    "altitude_m": (CONFIG.min_altitude, CONFIG.max_altitude, "m"),
+    "altitude_m": (*CONFIG.altitude, "m"),
     "curvature_1pm": (-1.0, 1.0, "1/m"),
     "speed_limit_mps": (0.1, 100.0, "m/s"),
     "speed_limit_kmh": (0.36, 360.0, "km/h"),
@@ -169,12 +167,10 @@ def _with_filled_heights(columns: Columns) -> Columns:
 
     Missing are NaN, heights that no road has, and 0 on a road that is nowhere near sea level.
     """
-    if "altitude_m" not in columns.values:
-        return columns
     import numpy as np
 
-    heights = np.array(columns.values["altitude_m"])
-    missing = ~((heights >= CONFIG.min_altitude) & (heights <= CONFIG.max_altitude))
+    heights = np.array(columns.values.get("altitude_m", ()))
+    missing = ~((heights >= CONFIG.altitude[0]) & (heights <= CONFIG.altitude[1]))
     others = np.abs(heights[~missing & (heights != 0)])
     if others.size and others.min() > CONFIG.near_zero:
         missing |= heights == 0
@@ -210,8 +206,8 @@ def _distance(columns: Columns) -> tuple[Array, Array | None]:
         return np.concatenate(([0.0], np.cumsum(lengths))), track
     columns.check_increasing("distance_m", "m", CONFIG.min_step)
     distance = np.array(given) - given[0]
-    way = lengths.sum()
-    if position and not CONFIG.min_distance_ratio < way / distance[-1] < CONFIG.max_distance_ratio:
+    way, (low, high) = lengths.sum(), CONFIG.distance_ratio
+    if position and not low < way / distance[-1] < high:
         wrong = f"distance_m covers {distance[-1]:.0f} m, latitude_deg and longitude_deg {way:.0f} m"
         raise InputError(f"{columns.source}: {wrong}; is distance_m in m?")
     return distance, track

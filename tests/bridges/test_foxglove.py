@@ -21,7 +21,7 @@ from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
 from gz_onboard.bridges.foxglove import LAYOUT
 from gz_onboard.bus._can import can
-from gz_onboard.dashboard import live
+from gz_onboard.dashboard import command as dashboard
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
@@ -63,7 +63,7 @@ def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Ite
         end = time.monotonic() + (duration or math.inf)
         yield lambda: stop.is_set() or time.monotonic() >= end
 
-    monkeypatch.setattr(live, "until_signalled", stopped)
+    monkeypatch.setattr(dashboard, "until_signalled", stopped)
     monkeypatch.setattr(command, "report", lambda _, text: said.append(text))
     arguments = ["foxglove", "--interface", "virtual", "--channel", channel, "--listen", "127.0.0.1:0"]
     thread = threading.Thread(target=cli.main, args=([*arguments, *options],))

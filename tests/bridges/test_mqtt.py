@@ -23,7 +23,7 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bridges import mqtt
 from gz_onboard.bridges.broker import PASSWORD, USER, Broker, read_login
-from gz_onboard.dashboard import live
+from gz_onboard.dashboard import command as dashboard
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import InputError
 from gz_onboard.events import Activity, State
@@ -46,7 +46,7 @@ def bridge(port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPat
         end = time.monotonic() + (duration or math.inf)
         yield lambda: stop.is_set() or time.monotonic() >= end
 
-    monkeypatch.setattr(live, "until_signalled", stopped)
+    monkeypatch.setattr(dashboard, "until_signalled", stopped)
     monkeypatch.setattr(mqtt, "report", lambda _, text: said.append(text))
     arguments = ["mqtt", f"127.0.0.1:{port}", "--interface", "virtual", "--channel", channel, "--name", "scooter"]
     thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
@@ -254,7 +254,7 @@ def test_each_value_of_a_picture_has_a_sensor():
 
 
 def broker_at(text: str, tls: str | None = None) -> Broker:
-    return Broker(text, "scooter", ("topic", b""), print, tls=tls)
+    return Broker(text, "scooter", ("hello", b""), ("will", b""), print, tls=tls)
 
 
 @pytest.mark.parametrize("text", ["", "broker:", "broker:0", "broker:99999", "mqtt://broker", "a b", "::1"])

@@ -14,7 +14,7 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.live import clock, pictures
+from gz_onboard.dashboard.command import clock, pictures
 from gz_onboard.dashboard.server import Feed, served
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.dashboard.view import TREND_STEP, View, encoded

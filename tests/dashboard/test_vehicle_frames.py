@@ -13,7 +13,7 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.live import view_of
+from gz_onboard.dashboard.command import view_of
 from gz_onboard.dashboard.vehicle_frames import RIDING_DEGC, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import Picture, View
 from gz_onboard.estimator.signals import TIMING

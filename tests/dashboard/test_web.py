@@ -23,10 +23,10 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.dashboard import server as web_server
-from gz_onboard.dashboard.live import host_and_port
 from gz_onboard.dashboard.server import MAX_THREADS, Feed, served
 from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate
+from gz_onboard.options import host_and_port
 from tests.dashboard.served import Sender, dashboard
 from tests.dashboard.test_picture import HEALTHY
 from tests.support import HEARS_CTRL_C, ROOT
@@ -145,7 +145,7 @@ def test_a_loop_that_hangs_gives_no_old_picture(monkeypatch, feed):
         monkeypatch.setattr(web_server, "OLDEST_S", -1.0)
         answer, text = asked(address, "/api/latest")
         assert (answer.status, text) == (503, b"There is no current picture.\n")
-        assert feed.after(0, 0.0) is None  # a stream that begins now waits for the next
+        assert feed.after(0, 0.0)[1] == b""  # a stream that begins now waits for the next
 
 
 @pytest.mark.parametrize(
