@@ -93,7 +93,7 @@ __all__ = [
 ]
 
 
-if not TYPE_CHECKING:  # to which a name that is none is a mistake
+if not TYPE_CHECKING:  # which reports misspelt names
 
     def __getattr__(name: str) -> object:
         if name not in __all__:

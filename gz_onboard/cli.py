@@ -18,7 +18,7 @@ from gz_onboard.imports import missing_extra
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
-    "learned": ("gz_onboard.daemon.learned", "show or reset what the daemon has learned of battery and riding"),
+    "learned": ("gz_onboard.daemon.learned", "show or reset the daemon's knowledge of battery and riders"),
     "route": ("gz_onboard.daemon.route", "give the running daemon a route, or clear it"),
     "dashboard": ("gz_onboard.dashboard.command", "show the daemon's range in a terminal or a browser"),
     "mqtt": ("gz_onboard.bridges.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
@@ -33,9 +33,9 @@ COMMANDS = {
     "calibrate": ("gz_onboard.lab.calibrate.command", "determine a vehicle's parameters from measurements"),
     "discover": (
         "gz_onboard.lab.discover.command",
-        "find what the model gets wrong on rides, name the cause, extend the model",
+        "find the model's errors on rides, name the cause, extend the model",
     ),
-    "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
+    "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or its contents to Parquet, CSV, ..."),
     "vehicle": ("gz_onboard.lab.vehicle.command", "begin a vehicle file, or check whether it fits the vehicle's logs"),
     "report": ("gz_onboard.lab.report", "show recorded rides as one self-contained HTML page, also for phones"),
     "history": ("gz_onboard.lab.history.command", "store rides in a file, and show their totals"),
@@ -94,7 +94,7 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
     statuses = "\n".join(f"  {status:<4} {text}" for status, text in EXIT_STATUSES.items())
     parser = _Parser(
         prog="gz-onboard",
-        description="Range of an electric scooter from its CAN bus, and what its model gets wrong.",
+        description="Range of an electric scooter from its CAN bus, and the errors of its model.",
         epilog=f"exit status:\n{statuses}",
     )
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")

@@ -17,7 +17,7 @@ EXIT_STATUSES = {
     BAD_INPUT: "the command line, a file or a parameter cannot be used, or one of several logs cannot",
     INTERRUPTED: "interrupted by Ctrl-C",
 }
-"""What the exit status of a command means."""
+"""Meaning of the exit status of a command."""
 _NAMES_REFUSED = (errno.ENAMETOOLONG, errno.EACCES)
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters

@@ -40,7 +40,7 @@ class RoleWindow(NamedTuple):
 
 
 class MessageWindow(NamedTuple):
-    """Frames of one message in one window; None stands for a role without a valid sample.
+    """Frames of one message in one window; the entry of a role without a valid sample is None.
 
     group: index into ``Codec.groups``, which names the roles.
     """
@@ -68,14 +68,14 @@ class Group:
 STALE_PERIODS = 10
 """A signal is stale after this many of its periods."""
 
-# What a signal can stand for, and its unit: SI, but temperatures in degrees Celsius and positions in degrees.
+# The role of a signal, and its unit: SI, but temperatures in degrees Celsius and positions in degrees.
 ROLES: dict[str, str] = {
     "pack_voltage": "V",
     "pack_current": "A",  # positive when discharging
     "inverter_voltage": "V",
     "inverter_current": "A",  # DC side, positive when driving
     "auxiliary_current": "A",  # at pack voltage, positive when consuming
-    "heater_power": "W",  # electric, out of the pack, beside the auxiliary current
+    "heater_power": "W",  # electric, out of the pack, not part of the auxiliary current
     "air_conditioner_power": "W",  # likewise
     "lowest_cell_voltage": "V",  # of the group of cells in series that has the lowest
     "cell_temperature": "degC",
@@ -105,12 +105,12 @@ ROLES: dict[str, str] = {
     "charge_plug": "1",
     "key": "1",  # 0: off
     "contactor": "1",  # of the pack, 0: open
-    "rider": "1",  # a number for each who rides, such as that of the key
+    "rider": "1",  # a number for each rider, such as that of the key
     "throttle": "1",
     "brake_switch": "1",
 }
 
-# What instruments beside the vehicle's own measure, for the bench and validation: no estimator needs it on board.
+# Measured by instruments on a test bench and for validation; the estimator needs none on board.
 INSTRUMENTS: dict[str, str] = {
     "brake_pressure_front": "Pa",
     "brake_pressure_rear": "Pa",
@@ -126,13 +126,13 @@ INSTRUMENTS: dict[str, str] = {
     **{f"pack_temperature_{i}": "degC" for i in range(1, 7)},
 }
 
-# The roles whose sensors are checked against each other: each must have a signal of its own.
+# Roles whose sensors are checked against each other: no two may share a signal.
 VOLTAGES = ("pack_voltage", "inverter_voltage")
 CURRENTS = ("pack_current", "inverter_current", "auxiliary_current")
-LOADS = ("heater_power", "air_conditioner_power")  # beside the auxiliaries
+LOADS = ("heater_power", "air_conditioner_power")  # not part of the auxiliary current
 SPEEDS = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
 
-# What a road vehicle can have at most, by unit, whatever its DBC allows: many give no limits.
+# Limits of any road vehicle, by unit: many DBC files give none.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "V": (0.0, 1500.0),
     "A": (-5000.0, 5000.0),
@@ -169,7 +169,7 @@ class State(IntEnum):
 
 
 class Activity(IntEnum):
-    """What the vehicle does; only riding teaches what a kilometre costs."""
+    """State of motion; consumption is learned while riding only."""
 
     UNKNOWN = 0  # neither speed nor charge plug
     RIDING = 1
@@ -189,12 +189,12 @@ class RouteState(IntEnum):
 
 
 class Reason(IntFlag):
-    """Why the estimate is not what it could be. The bits of RANGE_Status in dbc/range.dbc have these names."""
+    """Reasons for a wider interval or a missing number. The bits of RANGE_Status in dbc/range.dbc have these names."""
 
-    NO_PACK_VOLTAGE = 1 << 0  # the inverter's voltage stands in, or none
-    NO_PACK_CURRENT = 1 << 1  # the inverter's current and the auxiliary load stand in, or the model
+    NO_PACK_VOLTAGE = 1 << 0  # replaced by the inverter's voltage, if there is one
+    NO_PACK_CURRENT = 1 << 1  # replaced by the inverter's current and the auxiliary load, or the model
     NO_INVERTER_CURRENT = 1 << 2  # nothing to check the pack current with
-    NO_CELL_TEMPERATURE = 1 << 3  # the last known, then the ambient's, stands in
+    NO_CELL_TEMPERATURE = 1 << 3  # replaced by the last known, later by the ambient's
     NO_SPEED = 1 << 4
     NO_IMU = 1 << 5  # no lean; grade from altitude only
     NO_GPS = 1 << 6
@@ -209,12 +209,12 @@ class Reason(IntFlag):
     LOG_FAILED = 1 << 15  # the log cannot be written
     SENSOR_DISTRUSTED = 1 << 16  # a sensor contradicts the others and is left out; RANGE_Sensors says which
     SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
-    SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
+    SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and started again from the voltage
     SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
 
 
 KEEPING = Reason.LOG_FAILED | Reason.SAVE_FAILED
-"""Of what is kept of a ride: no range is less certain for them."""
+"""Reasons about the log and the saved state: the range is as certain as before."""
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 OF_RIDING = Reason.NO_SPEED | Reason.NO_IMU | Reason.NO_GPS | Reason.NO_INVERTER_CURRENT
 """Sensors that sleep on many vehicles while they are charged, and are not missed then."""
@@ -235,11 +235,11 @@ class Cause(IntEnum):
     WIND = 4  # that the model knows of
     CLIMB = 5  # of roads like those ridden; of a route, ahead on it
     TURNING = 6
-    AUXILIARIES = 7  # measured, beyond what the vehicle file says
+    AUXILIARIES = 7  # measured, beyond the value of the vehicle file
     PAYLOAD = 8  # as entered, against that of the vehicle file
     AGE = 9  # capacity and resistance of the cells against new ones
     CHARGE = 10  # state of charge; of a change, beyond the distance ridden
-    RIDING = 11  # what is expected of the riding to come beyond that of the last kilometres
+    RIDING = 11  # expected of the next kilometres, beyond the last ones
     UNEXPLAINED = 12  # measured over modelled consumption, as learned: soft tyres, wind, clothes, a dragging brake
 
 
@@ -251,10 +251,10 @@ class Explanation:
     reference: float  # m: the vehicle's rated range; of a change, the range before
     range: float  # m; of a change, with the distance ridden since
     causes: Mapping[Cause, float]  # m, by cause
-    forgotten: tuple[str, ...] = ()  # roles found faulty between, so that what they had taught was forgotten
+    forgotten: tuple[str, ...] = ()  # roles found faulty since: everything learned from them was forgotten
 
     def largest(self) -> list[tuple[Cause, float]]:
-        """The causes that are worth telling, the largest first, but for the charge, which is shown elsewhere."""
+        """The causes worth showing, the largest first, without the charge, which is shown elsewhere."""
         told = [each for each in self.causes.items() if each[0] is not Cause.CHARGE and abs(each[1]) >= TOLD]
         return sorted(told, key=lambda each: -abs(each[1]))
 
@@ -284,7 +284,7 @@ def cause_words(name: str) -> str:
 
 @dataclass(slots=True)
 class Estimate:
-    """What is known at one time. None stands for what is not known; it is never published as a number."""
+    """Estimates at one time; an unknown quantity is None, and never published as a number."""
 
     time: float  # s, on the codec's timeline
     state: State = State.STARTING

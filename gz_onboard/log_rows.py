@@ -68,7 +68,7 @@ RIDE_UNITS = {
     "energy": "J, drawn net",
     "energy_recovered": "J",
     "energy_distance": "m of the distance, which the energy is of",
-    "energy_missing": "s without voltage or current, which the energy lacks",
+    "energy_missing": "s without voltage or current, not in the energy",
     "ambient_temperature": "degC",
 }
 """Of the numbers of `ride_row`."""
@@ -111,18 +111,20 @@ def reason_names(found: Reason) -> list[str]:
 
 def estimate_row(estimate: Estimate) -> dict[str, object]:
     """Return an estimate as a row: SI units, state and reasons by name, None for unknown numbers."""
-    row: dict[str, object] = {}
-    for name in ESTIMATE_UNITS:
-        value = getattr(estimate, name)
-        # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
-        row[name] = float(f"{value:.7g}") if value is not None and isfinite(value) else None
-    row["time"] = round(estimate.time, 3)  # of a clock that begins in 1970, after it was set, seven digits are minutes
-    row["state"] = estimate.state.name
-    row["reasons"] = " ".join(reason_names(estimate.reasons))
-    row["activity"] = estimate.activity.name
-    row["route_state"] = estimate.route_state.name
-    row["distrusted"] = " ".join(estimate.distrusted)
-    return row
+    numbers = {name: getattr(estimate, name) for name in ESTIMATE_UNITS}
+    # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
+    row: dict[str, object] = {
+        name: float(f"{value:.7g}") if value is not None and isfinite(value) else None
+        for name, value in numbers.items()
+    }
+    return row | {
+        "time": round(estimate.time, 3),  # of a clock that begins in 1970, after it was set, seven digits are minutes
+        "state": estimate.state.name,
+        "reasons": " ".join(reason_names(estimate.reasons)),
+        "activity": estimate.activity.name,
+        "route_state": estimate.route_state.name,
+        "distrusted": " ".join(estimate.distrusted),
+    }
 
 
 def explanation_row(why: Explanation) -> dict[str, object]:

@@ -75,10 +75,6 @@ def _fetched(url: str) -> Path:
     return file
 
 
-def _jobs(option: str) -> Callable[[str], float]:
-    return number(option, 1, MOST_JOBS, kind=int, counted="processes")
-
-
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "log": (f"log: {_LOGS}", {"type": _log, "metavar": "LOG"}),
     "logs": (
@@ -90,15 +86,15 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"default": "reference", "metavar": "NAME|TOML"},
     ),
     "--vehicle-id": (
-        "ID of this vehicle when several share one file (default: from rides.json beside the log, or the vehicle file)",
+        "ID of this vehicle if several share a file (default: from rides.json next to the log, or the vehicle file)",
         {"metavar": "ID"},
     ),
     "--payload": (
-        "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
+        "mass of rider and luggage (default: from rides.json next to the log, or the vehicle file)",
         {"type": number("--payload", 0.0, MOST_PAYLOAD, "kg"), "metavar": "KG"},
     ),
     "--route": (
-        "the road that is to be ridden: GPX, or CSV as for `simulate`, altitudes not needed",
+        "the road ahead: GPX, or CSV as for `simulate`, altitudes not needed",
         {"type": Path, "metavar": "FILE"},
     ),
     "--effects": ("folder with effects of your own: Python code you trust", {"type": Path, "metavar": "DIR"}),
@@ -116,7 +112,10 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         "end, seconds into the log",
         {"dest": "end", "type": number("--to", 0.0, LONGEST_LOG, "s"), "metavar": "S"},
     ),
-    "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),
+    "--jobs": (
+        "number of parallel processes (default: one per processor)",
+        {"type": number("--jobs", 1, MOST_JOBS, kind=int, counted="processes"), "metavar": "N"},
+    ),
     "--json": (
         "write JSON to FILE, or to standard output instead of text",
         {"nargs": "?", "const": "-", "type": _json_file, "metavar": "FILE|-"},

@@ -55,7 +55,7 @@ def decode(
     document = json.loads(b"{" + body)
     saved_at, saved_uptime = document["saved_at"], document["uptime"]
     age = time - saved_at if CLOCK_SET_S < saved_at <= time else None
-    # A board without a clock of its own continues from the last time it knew, however long it was off. Two clocks that
+    # A board without a real-time clock continues from the last time it knew, however long it was off. Two clocks that
     # agree on the time since the same boot are believed all the same.
     if age is not None and kept < saved_at - CLOCK_BEHIND_S:
         same_boot = uptime and saved_uptime and abs(uptime - saved_uptime - age) < CLOCKS_AGREE_S

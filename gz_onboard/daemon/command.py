@@ -85,9 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     logging.getLogger("can").setLevel(logging.WARNING)
     names = arguments.channel or [CHANNEL]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--channel {twice[0]}: given twice; each of its frames would come twice")
     # A daemon runs unattended: the vehicle file's own code runs only if it is root's.
     vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, {ROOT}, arguments.vehicle_id)
     if not vehicle.mapping.reads_frames:

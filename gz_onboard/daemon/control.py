@@ -145,8 +145,8 @@ def route_of_request(request: object) -> Route:
     """
     if not isinstance(request, Mapping):
         raise InputError(f"route: must be an object of lists or null, is {shown(request)}")
-    columns = dict(request)
-    name = columns.pop("name", "route")
+    name = request.get("name", "route")
+    columns = {column: numbers for column, numbers in request.items() if column != "name"}
     if not isinstance(name, str) or len(name) > LONGEST_NAME:
         raise InputError(f"route: name: must be a text of at most {LONGEST_NAME} letters, is {shown(name)}")
     for column, numbers in columns.items():

@@ -188,7 +188,7 @@ class Daemon:
             self._keeper.save_if_due(pipeline, now_ns)
 
     def _report(self) -> None:
-        """Give systemd the status, and log what has changed."""
+        """Give systemd the status, and log changes of it."""
         pipeline, last = self.pipeline, self.pipeline.last
         said = {}
         if self._log and self._log.failing:

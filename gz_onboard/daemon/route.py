@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         request = {"route": None}
     elif arguments.file:
         columns = read_route_columns(arguments.file)
-        route_of(columns, "")  # what is wrong with it is said here, with the file's lines
+        route_of(columns, "")  # errors are found here already, where the lines of the file are known
         request = {"route": {"name": route_name(arguments.file)[:100], **columns.values}}
     answer = ask(arguments.socket, request)
     if "error" in answer:
