@@ -46,7 +46,7 @@ class Vehicle:
     range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
     range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
-    healthy: object = None  # file of what the discovery learned on healthy rides
+    healthy: object = None  # file that the discovery made on healthy rides
     vehicle_id: str = ""  # of one of several vehicles with this file; the end of its name
 
     __repr__ = brief
@@ -119,13 +119,13 @@ class Vehicle:
         return InputError(f"{self.file}: {message}")
 
 
-def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
+def find_vehicle(name: str | Path, folder: Path | None = None) -> Path:
     """Find the vehicle file `name`: a built-in vehicle, or a path, which has a slash or ends in ``.toml``.
 
-    beside: the folder to which the path is relative; default: the working directory. InputError if there is none.
+    folder: the folder to which the path is relative; default: the working directory. InputError if there is none.
     """
     built_in = sorted(file.stem for file in OWN.glob("*.toml"))
-    path = (beside or Path()) / name
+    path = (folder or Path()) / name
     if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
         if is_file(path):
             return path
@@ -134,7 +134,7 @@ def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a vehicle file, which ends in .toml")
     meant = f" (did you mean './{name}'?)" if is_file(path) else nearest(str(name), built_in)
-    shown_as = path if beside else name
+    shown_as = path if folder else name
     raise InputError(f"{shown_as}: no such vehicle file; built-in vehicles are {', '.join(built_in)}{meant}")
 
 

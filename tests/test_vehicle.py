@@ -110,8 +110,8 @@ def test_a_name_is_never_a_file_that_happens_to_be_there(tmp_path, monkeypatch):
     assert find_vehicle("mine.toml") == Path("mine.toml")
     with pytest.raises(InputError, match=r"did you mean '\./mine'"):
         find_vehicle("mine")
-    assert find_vehicle("mine.toml", beside=tmp_path) == tmp_path / "mine.toml"
-    assert find_vehicle("reference", beside=tmp_path) == OWN / "reference.toml"
+    assert find_vehicle("mine.toml", folder=tmp_path) == tmp_path / "mine.toml"
+    assert find_vehicle("reference", folder=tmp_path) == OWN / "reference.toml"
 
 
 # --- effects that come with a file are code -----------------------------------------------------------------------

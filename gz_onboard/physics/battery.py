@@ -90,9 +90,9 @@ class Window:
 class WeakGroup:
     """How the weakest of the groups in series differs from the mean cell."""
 
-    charge: float  # of SOC: so much less it holds when the mean cell is full
-    capacity: float  # by so much faster than the mean cell's its SOC falls: what it holds less, relative
-    resistance: float  # by so much higher, relative
+    charge: float  # of SOC: how much less it holds when the mean cell is full
+    capacity: float  # relative: how much less it holds, and so how much faster its SOC falls
+    resistance: float  # relative: how much higher it is
     sd: float = 0.0  # of the mean cell's SOC at which it ends
 
     def soc(self, mean: float) -> float:
@@ -125,7 +125,7 @@ class Battery:
     capacity: float  # A·h of a cell at 25 degC
     capacity_share: PiecewiseLinear  # of the capacity at 25 degC, over degC
     cutoff_voltage: float  # V of a cell
-    series_resistance: float  # ohm, of the pack beside its cells
+    series_resistance: float  # ohm, of the pack without its cells
     ocv_curve: PiecewiseLinear  # V of a cell over SOC, both increasing
     ocv_sd: float  # V
     r0: Mesh  # ohm

@@ -35,7 +35,7 @@ DIGITS = 1  # of the result [degC]: rows of tables at it are kept for seconds; 0
 
 @dataclass(frozen=True)
 class Drawable:
-    """Energy that a pack still delivers, and what that estimate is sensitive to."""
+    """Energy that a pack still delivers, and its sensitivities."""
 
     energy: float  # J, at the pack's terminals
     slope: float  # J: increase of the energy per unit of SOC
@@ -59,7 +59,7 @@ def drawable(
     is where the lowest cell meets the cut-off voltage under a load `give_up_load` sd above the mean, or the end of the
     charge that the vehicle uses. There the pack's voltage, and with it the current, is known; so the limit is a root
     in SOC alone. A group weaker than the mean cell (`Health.weakest`) ends the discharge; until then the pack delivers
-    what the mean cell does. The RC pair counts as settled: a discharge takes an hour, its time constant is a minute.
+    as much as the mean cell. The RC pair counts as settled: a discharge takes an hour, its time constant is a minute.
 
     power: above 0; form_factor_squared, overpotential: see `Battery.settled_current`.
     """
@@ -86,7 +86,7 @@ def drawable(
         return lost, drop / end_load * DISCHARGE.give_up_load_sd * load_sd
 
     def mean_current(soc: float, guess: float | None = None) -> float | None:
-        """Mean current [A]; where bursts exceed what the pack can give they are capped."""
+        """Mean current [A]; bursts beyond the pack's power are capped."""
         current = battery.settled_current(power, soc, temperature, form_factor_squared, overpotential, guess)
         return current or battery.settled_current(power, soc, temperature, 1.0, overpotential)
 

@@ -165,7 +165,7 @@ VEHICLE_PARAMETERS = (
     Parameter("side_friction", "1", 1.2, 0.15, 0.1, 2, "largest side force per load: Pacejka 2012, ch. 11"),
     Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
-    Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "what the motor's speed sensor shows over what is"),
+    Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "reading of the motor's speed sensor over the speed"),
     Parameter(
         "regeneration_torque_limit",
         "N·m",

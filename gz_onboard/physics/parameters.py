@@ -52,7 +52,7 @@ BATTERY_PARAMETERS = (
         prior_sd=0.005,
         low=0,
         high=2,
-        source="bus bars, fuse and BMS beside the cells",
+        source="bus bars, fuse and BMS, in series with the cells",
         grows_with=PACK_RESISTANCE,
     ),
     Parameter(
@@ -99,7 +99,7 @@ BATTERY_PARAMETERS = (
     ),
     Parameter("cell_voltage_error", "V", 0.0, 0.012, 0, 0, "sd: what one RC pair cannot follow, slow as minutes"),
     Parameter("cell_voltage_error_empty", "V", 0.0, 0.06, 0, 0, "sd: the same at 5 % SOC and below"),
-    Parameter("cell_voltage_error_time", "s", 600.0, 300.0, 10, 36000, "for so long it errs the same way"),
+    Parameter("cell_voltage_error_time", "s", 600.0, 300.0, 10, 36000, "correlation time of that error"),
     Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
     Parameter(
         "pack_heat_capacity",
@@ -226,7 +226,9 @@ SIMULATION_PARAMETERS = (
         grows_with=MASS,
     ),
     Parameter("cooling_factor", "1", 1.0, 0.1, 0.02, 5, "on what motor, inverter and pack give to the ambient air"),
-    Parameter("motor_iron_share", "1", 0.7, 0.2, 0, 1, "of iron and drag, in the stator; magnets and bearings beside"),
+    Parameter(
+        "motor_iron_share", "1", 0.7, 0.2, 0, 1, "of iron and drag, in the stator; the rest in magnets and bearings"
+    ),
 )
 
 

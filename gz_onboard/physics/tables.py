@@ -52,7 +52,7 @@ class TableLimits:
     rest_shift: Bounds = (-0.2, 0.2)  # V: cells rest tens of mV apart; more is a mistyped unit
     voltage_error: Bounds = (0.0, 0.2)  # V
     narrowest_window: float = 0.1  # of the charge: no vehicle carries ten times the cells that it uses
-    as_new: Bounds = (0.01, 0.99)  # nothing could be learned of what is certain
+    as_new: Bounds = (0.01, 0.99)  # nothing could be learned from a certainty
 
 
 LIMITS = TableLimits()

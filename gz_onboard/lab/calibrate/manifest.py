@@ -86,7 +86,7 @@ def read_manifest(
     if not steps:
         raise table.error(f"names no procedure; there are {', '.join(slots)}")
     try:
-        return find_vehicle(table.check_path("vehicle", table.text("vehicle", "reference")), beside=file.parent), steps
+        return find_vehicle(table.check_path("vehicle", table.text("vehicle", "reference")), folder=file.parent), steps
     except InputError as error:
         raise table.error(str(error), "vehicle") from error
 

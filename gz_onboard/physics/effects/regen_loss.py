@@ -15,7 +15,7 @@ PARAMETERS = (
         prior_sd=0.1,
         low=0.0,
         high=1.0,
-        source="a guess: a tenth of what the motor takes",
+        source="a guess: a tenth of the motor's power",
         ride_sd=0.02,
         healthy_sd=0.03,
     ),

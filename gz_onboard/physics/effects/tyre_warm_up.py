@@ -32,7 +32,7 @@ PARAMETERS = (
 )
 SHOWN_BY = (
     "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "
-    "after; a ride that starts with a warm motor and cold tyres splits it from what the motor's temperature does."
+    "after; a ride that starts with a warm motor and cold tyres splits it from effects of the motor's temperature."
 )
 
 
