@@ -38,7 +38,7 @@ import os
 import stat
 import sys
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -229,15 +229,9 @@ class Effect:
     port: Port
     parameters: tuple[Parameter, ...]
     term: Equation
-    doc: str
-    decay: Equation | None = None
-    variation: Equation | None = None
-    shown_by: str = ""
-    stores_energy: bool = False
-    turning_loss: bool = False
-    strengths: tuple[str, ...] = ()  # parameters that change where it is found; the first is reported first
-    varies: bool = False  # from ride to ride by itself
-    cause: tuple[str, str] | None = None  # name and equation of a change, for an effect of every model
+    decay: Equation | None
+    stores_energy: bool
+    module: ModuleType = field(repr=False)  # with the traits that only offline tools read: see `offline.traits`
 
     @property
     def reads(self) -> frozenset[str]:
@@ -322,16 +316,14 @@ def _effect(name: str, module: ModuleType) -> Effect:
         if not hasattr(module, attribute):
             raise InputError(f"{file}: an effect needs {attribute}")
     declared = tuple(parameter.name for parameter in module.PARAMETERS)
-    equations = {key: Equation.of(getattr(module, key)) for key in ("decay", "variation") if hasattr(module, key)}
-    traits = ("shown_by", "stores_energy", "turning_loss", "strengths", "varies", "cause")
-    given = {trait: getattr(module, trait.upper()) for trait in traits if hasattr(module, trait.upper())}
     effect = Effect(
         name=name,
         port=module.PORT,
         parameters=tuple(module.PARAMETERS),
         term=Equation.of(module.term),
-        doc=inspect.getdoc(module) or "",
-        **{"strengths": declared[:1]} | equations | given,
+        decay=Equation.of(module.decay) if hasattr(module, "decay") else None,
+        stores_energy=getattr(module, "STORES_ENERGY", False),
+        module=module,
     )
     if effect.decay and effect.decay.quantities[:1] != ("dt",):
         raise InputError(f"{file}: the first argument of decay must be dt")

@@ -17,6 +17,7 @@ from typing import TypedDict, Unpack
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.offline.series import stepper
+from gz_onboard.offline.traits import traits
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.functions import direction
 from gz_onboard.physics.model import air_density, drag_torque
@@ -147,7 +148,7 @@ class Scooter:
         model, p, roller = self.vehicle.model, self.vehicle.parameters, self.dynamometer
         self.chassis: Chassis = options.get("chassis") or StraightChassis()
         for effect in model.effects if self.chassis.name != "straight" else ():
-            if effect.turning_loss:
+            if traits(effect).turning_loss:
                 raise self.vehicle.error(
                     f"model.effects lists {effect.name}, and the {self.chassis.name} chassis has the same loss: "
                     "it would count twice; take one of them"

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
 from gz_onboard.offline.series import over, series
+from gz_onboard.offline.traits import traits
 from gz_onboard.physics.effect import QUANTITIES, Port, effects_in, known_effects, load_effect
 from gz_onboard.physics.model import Bound, stepping
 from gz_onboard.physics.parameters import declared_parameters
@@ -63,7 +64,7 @@ def test_the_limits_cover_every_quantity():
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.name)
 class TestContract:
     def test_says_what_it_is_and_where_it_is_from(self, effect):
-        assert len(effect.doc) > 30
+        assert len(traits(effect).doc) > 30
         assert isinstance(effect.port, Port)
         for parameter in effect.parameters:
             assert parameter.unit
@@ -189,7 +190,7 @@ def test_candidates_say_what_shows_them():
         "slow_relaxation",
         "ocv_hysteresis",
     ):
-        assert len(load_effect(name).shown_by) > 40
+        assert len(traits(load_effect(name)).shown_by) > 40
 
 
 def test_a_folder_of_effects(tmp_path):

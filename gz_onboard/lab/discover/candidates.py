@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from gz_onboard.offline.traits import traits
 from gz_onboard.physics.effect import BASE_EFFECTS, Effect, Parameter, Port, effects_in, known_effects, load_effect
 from gz_onboard.physics.parameters import declared_parameters
 
@@ -38,7 +39,7 @@ class Candidate:
     @property
     def varies(self) -> bool:
         """Whether it differs from ride to ride by itself."""
-        return self.effect is not None and self.effect.varies
+        return self.effect is not None and traits(self.effect).varies
 
 
 # name: (where it acts, None if it is a sensor or the cooling; parameter, equation, what shows it and splits it)
@@ -124,7 +125,9 @@ def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
     declared = declared_parameters()
     own = [load_effect(name) for name in known_effects()]
     changes: list[tuple[Port | None, Candidate]] = [
-        (e.port, Candidate(e.cause[0], _strengths(e), e.cause[1], e.shown_by)) for e in own if e.cause is not None
+        (effect.port, Candidate(known.cause[0], _strengths(effect), known.cause[1], known.shown_by))
+        for effect, known in ((effect, traits(effect)) for effect in own)
+        if known.cause
     ]
     for name, (place, parameter, equation, shown_by) in VEHICLE_CAUSES.items():
         changes.append((place, Candidate(name, (declared[parameter],), equation, shown_by)))
@@ -133,11 +136,12 @@ def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
     theirs = [name for name in effects_in(folder) if name not in packaged] if folder else []
     for effect in (load_effect(name, folder) for name in (*packaged, *theirs)):
         if strengths := _strengths(effect):
-            equation = effect.doc.splitlines()[0] if effect.doc else effect.name
+            known = traits(effect)
+            equation = known.doc.splitlines()[0] if known.doc else effect.name
             sign = 1 if strengths[0].low >= 0 else 0
-            found.append(Candidate(effect.name, strengths, equation, effect.shown_by, effect, sign))
+            found.append(Candidate(effect.name, strengths, equation, known.shown_by, effect, sign))
     return tuple(found)
 
 
 def _strengths(effect: Effect) -> tuple[Parameter, ...]:
-    return tuple(p for name in effect.strengths for p in effect.parameters if p.name == name)
+    return tuple(p for name in traits(effect).strengths for p in effect.parameters if p.name == name)

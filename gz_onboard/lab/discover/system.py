@@ -11,6 +11,7 @@ import numpy as np
 from gz_onboard.errors import InputError
 from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 from gz_onboard.offline.series import series, value_of
+from gz_onboard.offline.traits import traits
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
 from gz_onboard.physics.model import Bound
@@ -53,9 +54,9 @@ class System:
                 continue
             known = self._known(q, effect)
             value = value_of(Bound(effect, p), known, recall)
-            if effect.variation:
+            if variation := traits(effect).variation:
                 healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
-                value = value * effect.variation.bound({**p, **healthy})(known)
+                value = value * variation.bound({**p, **healthy})(known)
             found.append((effect, value))
         return found
 

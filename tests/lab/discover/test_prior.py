@@ -16,6 +16,7 @@ from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.prior import NUISANCE
 from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
+from gz_onboard.offline.traits import traits
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import LOGS
@@ -85,10 +86,11 @@ def test_effects_say_of_themselves_how_a_cause_shows():
     found = {cause.name: cause for cause in candidates()}
     for effect in map(load_effect, known_effects()):
         own = {parameter.name for parameter in effect.parameters}
-        assert set(effect.strengths) <= own
-        name = effect.cause[0] if effect.cause else effect.name
+        known = traits(effect)
+        assert set(known.strengths) <= own
+        name = known.cause[0] if known.cause else effect.name
         if name in found:
-            assert found[name].names == effect.strengths
-            assert effect.shown_by
+            assert found[name].names == known.strengths
+            assert known.shown_by
     assert found["headwind"].varies and found["headwind"].reads == ("drag_area",)
     assert found["inverter_loss"].names == ("inverter_loss_linear",)
