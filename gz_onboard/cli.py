@@ -19,7 +19,7 @@ from gz_onboard.imports import missing_extra
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
     "learned": ("gz_onboard.daemon.learned", "show or reset the daemon's knowledge of battery and riders"),
-    "route": ("gz_onboard.daemon.route", "give the running daemon a route, or clear it"),
+    "route": ("gz_onboard.daemon.control", "give the running daemon a route, or clear it"),
     "dashboard": ("gz_onboard.dashboard.command", "show the daemon's range in a terminal or a browser"),
     "mqtt": ("gz_onboard.bridges.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
     "foxglove": ("gz_onboard.bridges.foxglove", "show the daemon's range live in Foxglove"),

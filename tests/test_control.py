@@ -10,8 +10,7 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.daemon import control
-from gz_onboard.daemon.control import Control
-from gz_onboard.daemon.route import ask, route_text
+from gz_onboard.daemon.control import Control, ask, route_text
 from gz_onboard.errors import InputError
 from gz_onboard.events import RouteState
 from gz_onboard.pipeline import Pipeline

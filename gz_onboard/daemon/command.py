@@ -15,8 +15,8 @@ from pathlib import Path
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import LogLimits, Recorder
+from gz_onboard.daemon.control import SOCKET
 from gz_onboard.daemon.loop import Daemon, foreign_text, state_text
-from gz_onboard.daemon.route import SOCKET
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
 from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.options import CHANNEL, add_shared, number

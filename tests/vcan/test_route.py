@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gz_onboard.daemon.route import ask
+from gz_onboard.daemon.control import ask
 from gz_onboard.events import RouteState
 from tests.vcan.support import Listener, Running, wait_for
 
