@@ -230,19 +230,14 @@ class Battery:
         return terminal_voltage(ocv, r0, current, v1), slope - current * r0_slope
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
-        """The same battery with capacity, cut-off and resistances of a vehicle's `parameters`."""
+        """The battery as its file has it, with capacity, cut-off and resistances of a vehicle's `parameters`."""
         factor = parameters["cell_resistance_factor"]
-        battery = replace(
+        more = factor / self.resistance_factor
+        return replace(
             self,
             capacity=parameters["cell_capacity"],
             cutoff_voltage=parameters["cell_cutoff_voltage"],
             series_resistance=parameters["pack_series_resistance"],
-        )
-        if factor == self.resistance_factor:
-            return battery
-        more = factor / self.resistance_factor
-        return replace(
-            battery,
             r0=self.r0.scaled(more),
             r1=self.r1.scaled(more),
             c1=self.c1.scaled(1 / more),  # the time constant stays
@@ -267,20 +262,6 @@ class Battery:
     def weaken(self, weakest: WeakGroup | None) -> None:
         """From now on one group is weaker than the mean cell by so much. In place, as `age`."""
         self.health.weakest = weakest
-
-    def settled_lowest(
-        self, current: float, soc: float, temperature: float, overpotential: Overpotential | None = None
-    ) -> float:
-        """Voltage of the weakest group [V] at a mean pack `current` [A] once the RC pair has settled.
-
-        soc: of the mean cell; overpotential: see `settled_current`.
-        """
-        weakest, cell = self.health.weakest, current / self.cells_parallel
-        own, more = (weakest.soc(soc), weakest.resistance) if weakest else (soc, 0.0)
-        lost = (self.r0.at(own, temperature)[0] + self.r1.at(own, temperature)[0]) * cell
-        if overpotential:
-            lost += overpotential(cell, own, temperature, 1.0)
-        return self.ocv(own, temperature)[0] - (1 + more) * lost
 
     def settled_current(
         self,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import exp, sqrt
 
 from gz_onboard.constants import HOUR
-from gz_onboard.physics.battery import Battery, Overpotential
+from gz_onboard.physics.battery import Battery, Overpotential, WeakGroup
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class DischargeConfig:
 
 
 DISCHARGE = DischargeConfig()
+ALIKE = WeakGroup(0.0, 0.0, 0.0)  # of a pack whose groups are taken to be alike
 # Gauss-Legendre nodes and weights on [0, 1], of order 4: within 0.2 % of the energy
 _NODES = (0.0694318442, 0.3300094782, 0.6699905218, 0.9305681558)
 _WEIGHTS = (0.1739274226, 0.3260725774, 0.3260725774, 0.1739274226)
@@ -66,20 +67,24 @@ def drawable(
     least = battery.window.low if battery.window.given else DISCHARGE.below_empty
     charge = battery.pack_capacity(temperature) * HOUR
     cutoff = battery.cutoff_voltage
-    weakest = battery.health.weakest
-    end_sd = weakest.sd if weakest else 0.0
+    weakest = battery.health.weakest or ALIKE
     load_sd = sqrt(max(form_factor_squared - 1, 0.0))  # over the mean load
     end_load = 1 + DISCHARGE.give_up_load * load_sd
     end_current = end_load * power / (cutoff * battery.cells_series)
-    series_drop = battery.series_resistance * end_current / battery.cells_series
+    end_cell = end_current / battery.cells_parallel
+    lowest = cutoff + battery.series_resistance * end_current / battery.cells_series
 
     def margin(soc: float) -> float:
-        """Voltage of the lowest cell above the cut-off [V] at `end_current`."""
-        return battery.settled_lowest(end_current, soc, temperature, overpotential) - series_drop - cutoff
+        """Voltage of the weakest group above the cut-off [V] at `end_current` where the mean cell is at `soc`."""
+        soc = weakest.soc(soc)
+        lost = (battery.r0.at(soc, temperature)[0] + battery.r1.at(soc, temperature)[0]) * end_cell
+        if overpotential:
+            lost += overpotential(end_cell, soc, temperature, 1.0)
+        return battery.ocv(soc, temperature)[0] - (1 + weakest.resistance) * lost - lowest
 
     def at_end(end: float, above: float) -> tuple[float, float]:
         """(by_cutoff, end_drop_sd) of a discharge that ends at `end` with the margin `above` [V]."""
-        drop = max(battery.ocv(weakest.soc(end) if weakest else end, temperature)[0] - cutoff, 0.0)
+        drop = max(battery.ocv(weakest.soc(end), temperature)[0] - cutoff, 0.0)
         rise = (margin(end + DISCHARGE.voltage_span) - above) / DISCHARGE.voltage_span
         rise /= max(1 - drop / cutoff, 0.1)  # at constant power the current falls as the voltage rises
         lost = charge * cutoff * battery.cells_series / max(rise, DISCHARGE.least_slope)
@@ -93,7 +98,7 @@ def drawable(
     now, over = mean_current(soc), margin(soc)
     slope = charge * (power / now if now else cutoff * battery.cells_series)
     if over < 0 or soc <= least or now is None:
-        return Drawable(0.0, slope, soc, *at_end(soc, over), end_sd)
+        return Drawable(0.0, slope, soc, *at_end(soc, over), weakest.sd)
     end = _root(margin, (least, *(x for x in battery.ocv_curve.x if least < x < soc), soc), over)
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
@@ -101,8 +106,8 @@ def drawable(
         total += weight / now
     energy = power * charge * (soc - end) * total
     if end <= least:  # the vehicle stops before the voltage does: the cut-off does not count
-        return Drawable(energy, slope, end, end_sd=end_sd)
-    return Drawable(energy, slope, end, *at_end(end, 0.0), end_sd)
+        return Drawable(energy, slope, end, end_sd=weakest.sd)
+    return Drawable(energy, slope, end, *at_end(end, 0.0), weakest.sd)
 
 
 def _root(margin: Callable[[float], float], knots: Sequence[float], over: float) -> float:
