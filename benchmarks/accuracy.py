@@ -22,7 +22,8 @@ from typing import Any
 
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.decode import feed
+from gz_onboard.recording.logs import read_log
 from gz_onboard.vehicle import read_vehicle
 
 
@@ -104,8 +105,7 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
             samples.append(Sample(e.time, *soc, e.distance, *reach, *others, *ours))
 
     pipeline = Pipeline(vehicle, observer=observe)
-    for frames in read_frames(file):
-        pipeline.advance(frames, frames[-1][0])
+    feed(pipeline, read_log(file))
     return f"{file.parent.name}/{file.stem}", samples
 
 

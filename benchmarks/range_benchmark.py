@@ -37,7 +37,8 @@ from benchmarks.trial import commit
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import progress_bar
-from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.decode import feed
+from gz_onboard.recording.logs import read_log
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import read_vehicle
 
@@ -149,11 +150,8 @@ def follow(
     if route:
         forecaster = pipeline.estimator.route
         forecaster.follow(forecaster.prepare(read_route(route)))
-    first: int | None = None  # ns
-    for frames in read_frames(log):
-        first = frames[0][0] if first is None else first
-        if frames[-1][0] - first >= since * 1e9:
-            pipeline.advance(frames, frames[-1][0])
+    frames = read_log(log)
+    feed(pipeline, frames[frames.time_ns >= frames.time_ns[0] + since * 1e9])
     at = np.array(way)
     left = truth.distance[-1] - at[:, 0]
     later = at[:, 0] > at[0, 0] + SOME_WAY * truth.distance[-1]
@@ -249,8 +247,7 @@ def follow_ride(ride: Ride, state: State) -> tuple[Day, State]:
     pipeline = Pipeline(read_vehicle("reference"), observer=observe)
     if state:
         pipeline.estimator.restore(state, KEY, ride.away)
-    for frames in read_frames(ride.log):
-        pipeline.advance(frames, frames[-1][0])
+    feed(pipeline, read_log(ride.log))
     length = float(ride.truth.distance[-1])
     day = Day(ride.week, ride.number, ride.day, length, expected[0], ride.energy, last[0])
     return day, pipeline.estimator.snapshot(KEY)

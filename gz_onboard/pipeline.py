@@ -20,7 +20,7 @@ from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.events import EFF_FLAG, WINDOW, Estimate, Frame, Reason, State, hexadecimal
+from gz_onboard.events import EFF_FLAG, WINDOW, Estimate, Frame, MessageWindow, Reason, State, hexadecimal
 from gz_onboard.log_rows import (
     BATTERY_ENDS_TOPIC,
     CHANGE_TOPIC,
@@ -44,8 +44,8 @@ from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz
 TICKS_PER_WINDOW = round(WINDOW * 1e9 / TICK_NS)
-TICKS_PER_RANGE = 10  # range at 1 Hz
 WINDOW_NS = TICKS_PER_WINDOW * TICK_NS
+WINDOWS_PER_RANGE = 2  # range at 1 Hz
 FREE = (
     *range(0x600, 0x700, 0x10),
     *range(0x10, 0x600, 0x10),
@@ -97,11 +97,13 @@ class Pipeline:
         self.last: Estimate | None = None
         self.last_known: Estimate | None = None  # the last that had a range
         self._log = log
-        self._log_frames = log_frames
-        self._log_signals = log_signals
+        self.frame_log = log if log_frames else None
+        self.signal_log = log if log_signals else None
         self._observer = observer
         self._next_ns: int | None = None
-        self._ticks = 0
+        self._ticks = 0  # since a window ended, counted on
+        self._windows = 0
+        self._range_due = False  # frames of a second that has ended
         self._dropped_before = self._lost_before = 0
         self._recent = Reason(0)
         self._topics: dict[int, str] = {}
@@ -117,17 +119,22 @@ class Pipeline:
             self._next_ns, self._ticks = (frames[0][0] if frames else until_ns) + TICK_NS, 0
         out: list[Frame] = []
         if not -WINDOW_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
-            self._close_window(self._next_ns)
+            end = self._next_ns + -self._ticks % TICKS_PER_WINDOW * TICK_NS
+            self.end_window(self.codec.windows(), self.codec.seconds(end), end)
+            out += self.publish(end)
             begin = frames[0][0] if frames and self._next_ns <= frames[0][0] <= until_ns else until_ns
-            self._next_ns -= (self._next_ns - begin) // WINDOW_NS * WINDOW_NS  # on the same grid
+            self._next_ns, self._ticks = end + ((begin - end) // WINDOW_NS + 1) * WINDOW_NS, 0  # on the same grid
         done = 0
-        while self._next_ns <= until_ns:
-            end = bisect_left(frames, (self._next_ns,), done)
+        while (tick_ns := self._next_ns) <= until_ns:
+            end = bisect_left(frames, (tick_ns,), done)
             if end > done:
                 self._take(frames[done:end])
                 done = end
-            out += self._tick(self._next_ns)
+            if self._ticks % TICKS_PER_WINDOW == 0:
+                self.end_window(self.codec.windows(), self.codec.seconds(tick_ns), tick_ns)
+            self._ticks += 1
             self._next_ns += TICK_NS
+            out += self.publish(tick_ns)
         if done < len(frames):
             self._take(frames[done:])
         return out
@@ -140,31 +147,19 @@ class Pipeline:
 
     def _take(self, frames: Sequence[Frame]) -> None:
         self.codec.decode(frames)
-        if self._log and self._log_frames:
-            self._log.frames(frames)
+        if self.frame_log:
+            self.frame_log.frames(frames)
 
-    def _tick(self, time_ns: int) -> list[Frame]:
-        whole_second = self._ticks % TICKS_PER_RANGE == 0
+    def end_window(self, windows: Sequence[MessageWindow], now: float, time_ns: int) -> None:
+        """Make a step of the estimator with `windows` and an estimate; every second count faults and log.
+
+        The window ends at `now` [s] on the codec's timeline, `time_ns` by the clock of the frames.
+        """
+        whole_second = self._windows % WINDOWS_PER_RANGE == 0
+        self._windows += 1
         if whole_second:
             self._count_faults()
-        if self._ticks % TICKS_PER_WINDOW == 0 or self.last is None:
-            self._close_window(time_ns)
-        self._ticks += 1
-        assert self.last is not None
-        sent = self.publisher.status(self.last, time_ns)
-        if whole_second:
-            sent += self.publisher.range(self.last, self.counts(), time_ns)
-        if self._log:
-            if self._log_frames:
-                self._log.frames(sent)
-            if whole_second:
-                self._sample(self._log, time_ns, self.last)
-        return sent
-
-    def _close_window(self, time_ns: int) -> None:
-        """Make a step of the estimator and an estimate at the end of a window."""
-        now = self.codec.seconds(time_ns)
-        self.estimator.step(self.codec.windows())
+        self.estimator.step(windows)
         estimate = self.estimator.estimate(now)
         if self._recent or self.extra_reasons:
             estimate.reasons |= self._recent | self.extra_reasons
@@ -176,6 +171,21 @@ class Pipeline:
             self.last_known = estimate
         if self._observer:
             self._observer(estimate)
+        if whole_second:
+            self._range_due = True
+            if self._log:
+                self._sample(self._log, now, time_ns, estimate)
+
+    def publish(self, time_ns: int) -> list[Frame]:
+        """The frames to be sent at a tick, after the first window: status, and range if a second has ended with it."""
+        assert self.last is not None
+        sent = self.publisher.status(self.last, time_ns)
+        if self._range_due:
+            sent += self.publisher.range(self.last, self.counts(), time_ns)
+            self._range_due = False
+        if self.frame_log:
+            self.frame_log.frames(sent)
+        return sent
 
     def _count_faults(self) -> None:
         counts = self.counts()
@@ -194,7 +204,7 @@ class Pipeline:
             unknown=len(codec.unknown),
         )
 
-    def _sample(self, log: Log, time_ns: int, estimate: Estimate) -> None:
+    def _sample(self, log: Log, now: float, time_ns: int, estimate: Estimate) -> None:
         log.sample(ESTIMATE_TOPIC, time_ns, estimate_row(estimate))
         log.sample(STATUS_TOPIC, time_ns, self.status())
         for change, why in self.estimator.explainer.news():
@@ -202,21 +212,21 @@ class Pipeline:
         if estimate.battery_ends_latitude is not None and estimate.battery_ends_longitude is not None:
             there = estimate.battery_ends_latitude, estimate.battery_ends_longitude
             log.sample(BATTERY_ENDS_TOPIC, time_ns, location_row(time_ns, "battery_ends", *there, None))
-        if self._log_signals:
-            self._sample_signals(log, time_ns)
+        if self.signal_log:
+            self._sample_signals(self.signal_log, now, time_ns)
 
-    def _sample_signals(self, log: Log, time_ns: int) -> None:
+    def _sample_signals(self, log: Log, now: float, time_ns: int) -> None:
         """The latest signals of each message, at the time that they were seen, and the position."""
         codec, topics = self.codec, self._topics
         for identifier, (seen_ns, data) in codec.latest.items():
-            if time_ns - seen_ns < TICKS_PER_RANGE * TICK_NS:  # not again what was logged before
+            if time_ns - seen_ns < WINDOWS_PER_RANGE * WINDOW_NS:  # not again what was logged before
                 topic = topics.get(identifier)
                 if topic is None:
                     if (name := codec.message_name(identifier)) is None:  # a frame of an answer
                         continue
                     topic = topics[identifier] = f"/can/{name}"
                 log.sample(topic, time_ns, codec.values(identifier, data), seen_ns)
-        if found := self._positions.new(self.estimator.signals, codec.seconds(time_ns), time_ns):
+        if found := self._positions.new(self.estimator.signals, now, time_ns):
             seen_ns, row = found
             log.sample(LOCATION_TOPIC, time_ns, row, seen_ns)
 

@@ -246,12 +246,6 @@ class Codec:
         """The time of the last frame on the timeline [s]."""
         return self.seconds(self._last_ns)
 
-    def odd(self, frames: Sequence[Frame]) -> None:
-        """Count `frames` of implausible time, which are not decoded."""
-        self.received += len(frames)
-        for _ in frames:
-            self._fault("", TIME)
-
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline [s]."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9

@@ -4,91 +4,32 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS, Codec
-from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
+from gz_onboard.bus.publisher import Publisher
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
-from gz_onboard.events import Estimate, Frame
+from gz_onboard.events import Estimate
 from gz_onboard.lab.estimate_state import StateAt, WentOn, go_on
-from gz_onboard.lab.estimate_tally import PAUSE, Tally
+from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import check_ridden, of_ride, open_ride
 from gz_onboard.offline.signal_table import SignalTable
-from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
+from gz_onboard.pipeline import Pipeline, range_publisher
 from gz_onboard.progress import Progress
-from gz_onboard.recording.decode import decode_columns
-from gz_onboard.recording.frames import BATCH, FrameColumns
+from gz_onboard.recording.decode import decode_columns, feed
+from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.readers.contents import LogDamage
-from gz_onboard.recording.timeline import stray
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 IDENTIFIED_WITHIN = 60.0  # s from the first frame
-_GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
-_PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile
-
-
-class _Mute(Publisher):
-    """No bus, no range frames: encoding them would take a third of the time."""
-
-    def range(self, estimate: Estimate, counts: Counts, time_ns: int) -> list[Frame]:
-        return []
-
-    def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
-        return []
-
-
-def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = None) -> None:
-    """Take all frames of a log through `pipeline`; `progress` is called with the numbers of frames taken.
-
-    Gaps are ridden through as a live bus would have it, up to a minute; a longer one is a pause of the recording.
-    """
-    now: int | None = None
-    odd = stray(frames.time_ns)
-    for start in range(0, len(frames), BATCH):
-        batch, left_out = frames[start : start + BATCH], odd[start : start + BATCH]
-        if left_out.any():
-            pipeline.codec.odd(batch[left_out].tuples())
-        for portion in _without_jumps(batch[~left_out].tuples()):
-            first, last = portion[0][0], portion[-1][0]
-            if now is None:
-                now = first
-            if len(portion) < CONFIRM and not -TICK_NS <= last - now <= _PAUSE_NS:  # an odd stamp: the codec judges it
-                pipeline.advance(portion, now)
-                continue
-            if _GAP_NS < first - now <= _PAUSE_NS:
-                for step in range(now + _GAP_NS, first, _GAP_NS):
-                    pipeline.advance((), step)
-            begun = CONFIRM if first - now > _PAUSE_NS else 0
-            if begun:  # the ride goes on where the new time is believed, not at the end of the portion
-                pipeline.advance(portion[:begun], portion[:begun][-1][0])
-            pipeline.advance(portion[begun:], last)
-            now = last
-        if progress:
-            progress(len(batch))
-
-
-def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
-    """Parts of `batch` in which time neither goes back nor leaps by more than a gap, and none longer than that."""
-    if not batch:
-        return
-    if 0 <= batch[-1][0] - batch[0][0] <= _GAP_NS:  # nearly all; single odd stamps within are the codec's business
-        yield batch
-        return
-    begin = 0
-    for i in range(1, len(batch)):
-        leap = not -TICK_NS <= batch[i][0] - batch[i - 1][0] <= _GAP_NS
-        if leap or batch[i][0] - batch[begin][0] > _GAP_NS:  # on a slow bus a batch takes many seconds
-            yield batch[begin:i]
-            begin = i
-    yield batch[begin:]
 
 
 @dataclass(frozen=True)
@@ -191,8 +132,6 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         pipeline.estimator.forecaster.load.ledger = Ledger()
     if how.route:
         pipeline.estimator.route.follow(pipeline.estimator.route.prepare(how.route))
-    if not how.frames:
-        pipeline.publisher = _Mute()
     feed(pipeline, ride.frames, progress)
     check_ridden(ride.source, ride.vehicle, pipeline.codec)
     if tally.last:  # what came after the last whole second counts too

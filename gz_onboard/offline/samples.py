@@ -110,11 +110,7 @@ def read_roles(log: Path, vehicle: Vehicle, codec: Codec, frames: FrameColumns) 
     codec: a new one, which is left as if it had decoded the frames. Raises InputError for a log that is not of the
     vehicle.
     """
-    odd = stray(frames.time_ns)
-    if odd.any():
-        codec.odd(frames[odd].tuples())
-        frames = frames[~odd]
-    columns = decode_columns(frames, codec)
+    columns = decode_columns(frames, codec, stray(frames.time_ns))
     check_ridden(log, vehicle, codec)
     return {role: column for role, column in columns.items() if len(column[0]) > 1}
 

@@ -1,4 +1,4 @@
-"""Decode recorded frames by columns, with the same values and fault counts as the live codec.
+"""Decode recorded frames by columns, with the values, windows and fault counts of the live codec.
 
 The frames are grouped by channel and identifier, and each signal is extracted from all frames of its message at once.
 Rare cases go frame by frame through the live codec: answers to requests, and messages that come from more than one
@@ -9,21 +9,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from itertools import repeat
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, Accumulator, Codec, Handler
+from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Accumulator, Codec, Handler
 from gz_onboard.bus.layout import PAUSE, MappedMessage, first_bit, is_not_available, raw_range
-from gz_onboard.bus.mapping import BusMapping, Protection
+from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.requests import FUNCTIONAL
-from gz_onboard.events import ERR_FLAG, RTR_FLAG, STALE_PERIODS, TRANSMITTED
+from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, STALE_PERIODS, TRANSMITTED, Frame, MessageWindow, RoleWindow
+from gz_onboard.pipeline import TICK_NS, TICKS_PER_WINDOW, WINDOW_NS, Pipeline
+from gz_onboard.progress import Progress
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.timeline import on_timeline
+from gz_onboard.recording.timeline import on_timeline, stray
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -31,93 +36,387 @@ if TYPE_CHECKING:
 
 Column = tuple[Array, Array]
 """Times [s] and values (SI)."""
+Rows = NDArray[np.int64]
+"""Indices of frames in their log, ascending."""
+_LONGEST_GAP_NS = AHEAD_NS
+"""Without frames for longer the recording was stopped; in a shorter gap windows without frames end."""
+_WINDOWS_AT_ONCE = 1024  # that are made of the columns of one message
 _WIDEST_COUNTER = 32  # bits
+_WIDEST_SUM = 40  # bits of integers that can be added up as such: 8 million of them have 63
 _MOST_PLACES = 4096  # channels and identifiers: beyond this the codec itself decides which of them it remembers
 _NEVER_NS = -1 << 62
 _NO_DATA = ERR_FLAG | RTR_FLAG
 
 
-def decode_columns(frames: FrameColumns, codec: Codec) -> dict[str, Column]:
-    """Decode `frames`: (times [s], values in SI units) by role, in the order of the frames.
+class Step(NamedTuple):
+    """One window: what came between two steps of the estimator."""
+
+    end_ns: int  # on the timeline
+    clock_ns: int  # the same by the clock of the frames
+    follows: bool  # begins where the window before ended
+    frames: slice  # of the log
+    windows: list[MessageWindow]
+
+
+@dataclass
+class _Column:
+    """The raw values of a signal in the frames of its message, and which of them are real; shape (n,)."""
+
+    source: Source
+    raw: NDArray[Any]
+    real: Mask
+
+
+@dataclass
+class _Decoded:
+    """The n good frames of a message that roles come from. rows, time_ns: shape (n,)."""
+
+    group: int
+    rows: Rows
+    time_ns: NDArray[np.int64]  # on the timeline
+    columns: list[_Column]
+
+    def windows(self, number: NDArray[np.int64]) -> Iterator[tuple[int, MessageWindow]]:
+        """Its windows and the number of each, in their order; number: of the window of each frame of the log."""
+        number = number[self.rows]
+        edges = _edges(number)
+        for first in range(0, len(edges) - 1, _WINDOWS_AT_ONCE):
+            ends = edges[first : first + _WINDOWS_AT_ONCE + 1]
+            part = slice(ends[0], ends[-1])
+            roles = [_role_windows(column, part, number, self.time_ns) for column in self.columns]
+            times = (self.time_ns[ends[1:] - 1] * 1e-9).tolist()
+            made = map(MessageWindow, repeat(self.group), times, np.diff(ends).tolist(), zip(*roles, strict=True))
+            yield from zip(number[ends[:-1]].tolist(), made, strict=True)
+
+
+class DecodedLog:
+    """The frames of one log, decoded by columns: either the samples of each role, or windows for the estimator.
 
     codec: one that has decoded nothing yet. It is left as if it had decoded all frames one by one: with the faults,
     the frames lost, unknown and copied, the leaps of the clock, the latest frames and the origins of the messages.
-    Times are since the first frame.
+    Times are since the first frame. odd: mask of frames whose time is wrong, which are not decoded.
     """
-    codec.received += len(frames)
-    kept, passed_ns = on_timeline(frames.time_ns, codec)
-    frames = frames if len(kept) == len(frames) else frames[kept]
-    places = list(_by_place(frames))
-    messages = [None if identifier & _NO_DATA else codec.origins.message(identifier) for _, identifier, _ in places]
-    heard = Counter(message.name for message in messages if message)
-    asked = {*FUNCTIONAL, *(r.request for r in codec.mapping.requests), *(r.response for r in codec.mapping.requests)}
-    asked = asked if codec.mapping.requests else set()
-    found: dict[str, Column] = {}
-    one_by_one = []
-    for (channel, identifier, rows), message in zip(places, messages, strict=True):
-        several = message is not None and heard[message.name] > 1
-        if len(places) > _MOST_PLACES or identifier in asked or several:
-            one_by_one.append(rows)
-            continue
-        handler = _handler(codec, channel, identifier)
-        if identifier & ERR_FLAG:
-            codec.error_frames += len(rows)
-        elif message is None:
-            codec.unknown[identifier] = codec.unknown.get(identifier, 0) + len(rows)
-        elif handler is codec._decoders[message.name] and (layout := _layout(message, codec.mapping)):
-            found |= _decode_message(layout, codec, identifier, frames[rows], passed_ns[rows])
-        else:
-            one_by_one.append(rows)
-    if one_by_one:
-        rows = np.sort(np.concatenate(one_by_one))
-        found |= _decode_one_by_one(frames[rows], passed_ns[rows], codec)
-    return {role: found[role] for group in codec.groups for role in group.roles if role in found}
+
+    def __init__(self, frames: FrameColumns, codec: Codec, odd: Mask | None = None) -> None:
+        self.frames, self.codec = frames, codec
+        self._odd = np.zeros(len(frames), bool) if odd is None else odd
+        timed = np.flatnonzero(~self._odd)
+        self._kept, self._passed_ns = np.zeros(len(frames), bool), np.zeros(len(frames), np.int64)
+        self._kept[timed], self._passed_ns[timed] = on_timeline(frames.time_ns[timed], codec)
+        kept = np.flatnonzero(self._kept)
+        following = np.searchsorted(kept, np.arange(len(frames))).clip(max=max(len(kept) - 1, 0))
+        latest = np.maximum.accumulate(self._passed_ns[kept])
+        self._now_ns = latest[following]  # when each frame came: one of a wrong time with the next of a good one
+        codec.faults.clear()  # of odd times, counted here with their frames
+        self._events: list[tuple[dict[Any, int], Any, Rows, NDArray[np.int64] | None]] = []
+        self._count(vars(codec), "received", np.arange(len(frames)))
+        self._count(codec.faults, ("", TIME), np.flatnonzero(~self._kept))
+        self._good: dict[int, Rows] = {}  # by identifier
+        self._decoded: list[_Decoded] = []
+        self._one_by_one: Rows = np.zeros(0, np.int64)
+        self._decode(kept)
+        self._origin_ns = codec._origin_ns
+
+    def samples(self) -> dict[str, Column]:
+        """(times [s], values in SI units) by role, in the order of the frames."""
+        found: dict[str, Column] = {}
+        for message in self._decoded:
+            time = message.time_ns.astype(float) * 1e-9
+            for column in message.columns:
+                source, real = column.source, column.real
+                if real.any():
+                    found[source.role] = time[real], column.raw[real].astype(float) * source.factor + source.offset
+        found |= self._samples_one_by_one()
+        for counts, key, rows, numbers in self._events:
+            counts[key] = counts.get(key, 0) + (len(rows) if numbers is None else int(numbers.sum()))
+        self.see_latest(len(self.frames))
+        return {role: found[role] for group in self.codec.groups for role in group.roles if role in found}
+
+    def steps(self) -> Iterator[Step]:
+        """The windows of the live pipeline; with each the codec has counted what it would have counted until then.
+
+        They end on a grid that begins with the first frame. In a gap between frames windows without any end, in a
+        longer one the recording was stopped.
+        """
+        if not len(self.frames):
+            return
+        now = self._now_ns
+        number = (now - TICK_NS) // WINDOW_NS + 1  # of the window of each frame
+        messages = [message.windows(number) for message in self._decoded]
+        waiting = [next(windows, None) for windows in messages]
+        events = self._events_of(number)
+        event = next(events, None)
+        begin, follows = 0, False
+        edges = _edges(number)
+        for end in edges[1:].tolist():
+            before, last = int(number[begin]), end == len(now)
+            after = before if last else int(number[end])
+            paused = not last and now[end] - now[end - 1] > _LONGEST_GAP_NS
+            while event and event[0] <= before:
+                _, counts, key, count = event
+                counts[key] = counts.get(key, 0) + count
+                event = next(events, None)
+            windows = []
+            if len(self._one_by_one):
+                self._take(self._one_by_one[slice(*np.searchsorted(self._one_by_one, (begin, end)))])
+                windows = self.codec.windows()
+            if last:  # a window that has not ended
+                break
+            for i, window in enumerate(waiting):
+                if window and window[0] == before:
+                    windows.append(window[1])
+                    waiting[i] = next(messages[i], None)
+            clock_ns = int(self.frames.time_ns[end - 1] - self._passed_ns[end - 1])
+            for ended in range(before, before + 1 if paused else after):
+                end_ns = TICK_NS + ended * WINDOW_NS
+                yield Step(end_ns, end_ns + clock_ns, follows, slice(begin, end), windows)
+                begin, windows, follows = end, [], True
+            follows = not paused
+        self.see_latest(len(now))
+
+    def see_latest(self, end: int) -> None:
+        """Let the codec know the latest good frame of each identifier among those before row `end` of the log."""
+        frames = self.frames
+        for identifier, rows in self._good.items():
+            if count := int(np.searchsorted(rows, end)):
+                row = rows[count - 1]
+                data = frames.data[row, : frames.length[row]].tobytes()
+                self.codec.latest[identifier] = int(frames.time_ns[row]), data
+
+    def tuples(self, rows: slice) -> list[Frame]:
+        """The frames of a part of the log but those of wrong times."""
+        return self.frames[rows][~self._odd[rows]].tuples()
+
+    def until(self, rows: slice, end_ns: int) -> int:
+        """The first row of a part of the log that came not before `end_ns` on the timeline."""
+        return int(rows.start + np.searchsorted(self._now_ns[rows], end_ns))
+
+    def _count(self, counts: dict[Any, int], key: Any, rows: Rows, numbers: NDArray[np.int64] | None = None) -> None:
+        """Have `counts[key]` count the frames in these rows, or these numbers at them."""
+        if len(rows):
+            self._events.append((counts, key, rows, numbers))
+
+    def _events_of(self, number: NDArray[np.int64]) -> Iterator[tuple[int, dict[Any, int], Any, int]]:
+        """(number of the window, counts, key, how many more) for all that is counted, in the order of the windows."""
+        parts = []
+        for i, (_, _, rows, numbers) in enumerate(self._events):
+            windows = number[rows]
+            edges = _edges(windows)
+            many = np.diff(edges) if numbers is None else np.add.reduceat(numbers, edges[:-1])
+            parts.append((windows[edges[:-1]], np.full(len(many), i), many))
+        windows, which, many = (np.concatenate(part) for part in zip(*parts, strict=True))
+        for row in np.argsort(windows, kind="stable").tolist():
+            counts, key, _, _ = self._events[which[row]]
+            yield int(windows[row]), counts, key, int(many[row])
+
+    # --- decoding ---------------------------------------------------------------------------------------------
+
+    def _decode(self, rows: Rows) -> None:
+        """Decode the frames in these rows, as far as it can be done by columns."""
+        codec, mapping = self.codec, self.codec.mapping
+        places = _by_place(self.frames, rows)
+        messages = [None if identifier & _NO_DATA else codec.origins.message(identifier) for _, identifier, _ in places]
+        heard = Counter(message.name for message in messages if message)
+        asked = {*FUNCTIONAL, *(r.request for r in mapping.requests), *(r.response for r in mapping.requests)}
+        asked = asked if mapping.requests else set()
+        groups = {group.message: i for i, group in enumerate(codec.groups)}
+        one_by_one = []
+        for (channel, identifier, those), message in zip(places, messages, strict=True):
+            several = message is not None and heard[message.name] > 1
+            if len(places) > _MOST_PLACES or identifier in asked or several:
+                one_by_one.append(those)
+                continue
+            handler = _handler(codec, channel, identifier)
+            if identifier & ERR_FLAG:
+                self._count(vars(codec), "error_frames", those)
+            elif message is None:
+                self._count(codec.unknown, identifier, those)
+            elif handler is codec._decoders[message.name] and (layout := _layout(message, mapping)):
+                self._decode_message(layout, groups.get(message.name), identifier, those)
+            else:
+                one_by_one.append(those)
+        if one_by_one:
+            self._one_by_one = np.sort(np.concatenate(one_by_one))
+
+    def _decode_message(self, mapped: MappedMessage, group: int | None, identifier: int, rows: Rows) -> None:
+        """Decode all frames of one message; group: that of the codec, None for a message without roles."""
+        message, n, protection, faults = mapped.message, mapped.message.length, mapped.protection, self.codec.faults
+        right = self.frames.length[rows] == n
+        self._count(faults, (message.name, LENGTH), rows[~right])
+        rows = rows[right]
+        data = self.frames.data[rows, :n]
+        if group is not None and protection.crc and len(rows):
+            right = _has_right_crc(data)
+            self._count(faults, (message.name, CRC), rows[~right])
+            rows, data = rows[right], data[right]
+        if group is not None and protection.counter:
+            wrong, missing = _follow_counter(mapped, data, self._passed_ns[rows])
+            self._count(faults, (message.name, COUNTER), rows[wrong])
+            jumps = np.flatnonzero(missing)
+            self._count(self.codec.lost, message.name, rows[jumps], missing[jumps])
+            rows, data = rows[~wrong], data[~wrong]
+        if not len(rows):
+            return
+        self._good[identifier] = rows
+        if group is None:
+            return
+        columns: list[_Column] = []
+        seen: Mask = np.zeros(len(rows), bool)  # with a signal of ours, on a page of a multiplexer
+        for source, signal, limits in zip(mapped.sources, mapped.signals, mapped.limits, strict=True):
+            raw = _raw(signal, data)
+            present: Mask = np.ones(len(data), bool)
+            if pager := _pager(message, signal):
+                present = np.isin(_raw(pager, data), list(signal.multiplexer_ids or ()))
+            real = present & _within(raw, signal, limits)
+            absent = present & ~real & _is_code(raw, signal, mapped.not_available)
+            place = f"{source.message}.{source.signal}"
+            self._count(faults, (place, NOT_AVAILABLE), rows[absent])
+            self._count(faults, (place, RANGE), rows[present & ~real & ~absent])
+            wide = signal.length > _WIDEST_SUM
+            columns.append(_Column(source, raw.astype(float) if wide else raw, real))
+            seen |= present
+        if not seen.all():
+            rows, columns = rows[seen], [_Column(c.source, c.raw[seen], c.real[seen]) for c in columns]
+        if len(rows):
+            self._decoded.append(_Decoded(group, rows, self._passed_ns[rows], columns))
+
+    def _take(self, rows: Rows) -> None:
+        """Let the codec decode the frames in these rows, at their times on the timeline."""
+        for row, frame in zip(rows.tolist(), self.frames[rows].tuples() if len(rows) else (), strict=True):
+            self._take_one(row, frame)
+
+    def _take_one(self, row: int, frame: Frame) -> bool:
+        """Let the codec decode one frame; whether it was good."""
+        (time_ns, identifier, data, channel), codec = frame, self.codec
+        passed = int(self._passed_ns[row])
+        codec._origin_ns = time_ns - passed  # as it was then: a clock that was set moves it
+        dropped = _handler(codec, channel & ~TRANSMITTED, identifier)(passed, data)
+        codec._origin_ns = self._origin_ns
+        if not dropped:
+            codec.latest[identifier] = (time_ns, data)
+        return not dropped
+
+    def _samples_one_by_one(self) -> dict[str, Column]:
+        """The samples of the frames that the codec decodes itself."""
+        codec, samples = self.codec, dict[str, list[tuple[float, float]]]()
+        by_name = {accumulator.mapped.message.name: accumulator for accumulator in codec._accumulators}
+
+        @cache
+        def accumulators(identifier: int) -> list[Accumulator]:
+            """The accumulators that frames with this identifier can add to."""
+            message = codec.origins.message(identifier)
+            names = [r.name for r in codec.mapping.requests if r.response == identifier]
+            names += [message.name] if message else []
+            return [by_name[name] for name in names if name in by_name]
+
+        rows = self._one_by_one
+        for row, frame in zip(rows.tolist(), self.frames[rows].tuples(), strict=True):
+            for accumulator in accumulators(frame[1]) if self._take_one(row, frame) else ():
+                if window := accumulator.window():
+                    for source, sample in zip(accumulator.mapped.sources, window.roles, strict=True):
+                        if sample:
+                            samples.setdefault(source.role, []).append((sample.time, sample.value))
+        columns = {role: np.array(pairs) for role, pairs in samples.items()}
+        return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
 
-def _by_place(frames: FrameColumns) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Group the frames: (channel, identifier, rows in ascending order), in the order of their first frames."""
-    places = frames.bus.astype(np.int64) << 32 | frames.identifier
+def decode_columns(frames: FrameColumns, codec: Codec, odd: Mask | None = None) -> dict[str, Column]:
+    """Decode `frames`: see `DecodedLog.samples`."""
+    return DecodedLog(frames, codec, odd).samples()
+
+
+def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = None) -> None:
+    """Take all frames of a log through a new `pipeline`, in the windows of the daemon.
+
+    progress: called with numbers of frames taken.
+    """
+    decoded = DecodedLog(frames, pipeline.codec, stray(frames.time_ns))
+    done = 0
+    for step in decoded.steps():
+        if pipeline.frame_log:
+            _log_frames(pipeline, decoded, step)
+        if pipeline.signal_log:
+            decoded.see_latest(step.frames.stop)
+        pipeline.end_window(step.windows, step.end_ns * 1e-9, step.clock_ns)
+        if pipeline.frame_log:
+            pipeline.publish(step.clock_ns)
+        if progress:
+            progress(step.frames.stop - done)
+        done = step.frames.stop
+    if pipeline.frame_log:
+        pipeline.frame_log.frames(decoded.tuples(slice(done, len(frames))))
+    if progress:
+        progress(len(frames) - done)
+
+
+def _log_frames(pipeline: Pipeline, decoded: DecodedLog, step: Step) -> None:
+    """Log the frames of a window, and between them the status frames that the daemon would have sent."""
+    assert pipeline.frame_log
+    rows = step.frames
+    for tick in range(TICKS_PER_WINDOW - 1, 0, -1) if step.follows else ():
+        end = decoded.until(rows, step.end_ns - tick * TICK_NS)
+        pipeline.frame_log.frames(decoded.tuples(slice(rows.start, end)))
+        pipeline.publish(step.clock_ns - tick * TICK_NS)
+        rows = slice(end, rows.stop)
+    pipeline.frame_log.frames(decoded.tuples(rows))
+
+
+def _edges(number: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The rows where another number begins, from 0 to the length of `number`."""
+    edges: NDArray[np.int64] = np.concatenate(([0], np.flatnonzero(np.diff(number)) + 1, [len(number)]))
+    return edges
+
+
+def _role_windows(
+    column: _Column, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64]
+) -> list[RoleWindow | None]:
+    """What a signal showed in each window of a part of its message's frames; number: of the window of each frame."""
+    source, raw, real, number, time_ns = column.source, column.raw[part], column.real[part], number[part], time_ns[part]
+    known = number[_edges(number)[:-1]]
+    if not real.all():
+        raw, number, time_ns = raw[real], number[real], time_ns[real]
+    if not len(raw):
+        return [None] * len(known)
+    edges = _edges(number)
+    begins, last, count = edges[:-1], edges[1:] - 1, np.diff(edges)
+    mean = np.add.reduceat(raw, begins) / count
+    squares: Any = repeat(None)
+    if source.role in SQUARED:
+        square = source.factor * source.factor * np.add.reduceat(raw.astype(float) ** 2, begins) / count
+        squares = (square + source.offset * (2 * source.factor * mean + source.offset)).tolist()
+    made: list[RoleWindow | None] = list(
+        map(
+            RoleWindow,
+            (time_ns[last] * 1e-9).tolist(),
+            (raw[last] * source.factor + source.offset).tolist(),
+            count.tolist(),
+            (mean * source.factor + source.offset).tolist(),
+            squares,
+        )
+    )
+    if len(made) == len(known):
+        return made
+    windows: list[RoleWindow | None] = [None] * len(known)
+    for place, window in zip(np.searchsorted(known, number[begins]).tolist(), made, strict=True):
+        windows[place] = window
+    return windows
+
+
+def _by_place(frames: FrameColumns, rows: Rows) -> list[tuple[int, int, Rows]]:
+    """Group the frames in these rows: (channel, identifier, rows of those), in the order of their first frames."""
+    places = (frames.bus.astype(np.int64) << 32 | frames.identifier)[rows]
     known = np.unique(places)
     number = np.searchsorted(known, places).astype(np.uint16 if len(known) < 1 << 16 else np.int64)
-    order = np.argsort(number, kind="stable")  # of 16 bits: a radix sort
+    order = rows[np.argsort(number, kind="stable")]  # of 16 bits: a radix sort
     ends = np.cumsum(np.bincount(number, minlength=len(known)))
     parts = np.split(order, ends[:-1]) if len(known) else []
-    found = [(place >> 32, place & 0xFFFF_FFFF, rows) for place, rows in zip(known.tolist(), parts, strict=True)]
+    found = [(place >> 32, place & 0xFFFF_FFFF, those) for place, those in zip(known.tolist(), parts, strict=True)]
     return sorted(found, key=lambda place: int(place[2][0]))
 
 
 def _handler(codec: Codec, channel: int, identifier: int) -> Handler:
     """The codec's handler for frames from a place; the first call for a place lets the codec choose the origin."""
     return codec._handlers.setdefault(channel, {}).get(identifier) or codec._first_heard(channel, identifier)
-
-
-def _decode_one_by_one(frames: FrameColumns, passed_ns: NDArray[np.int64], codec: Codec) -> dict[str, Column]:
-    """Decode frames through the handlers of the codec, at these times on its timeline."""
-    origin_ns, samples = codec._origin_ns, dict[str, list[tuple[float, float]]]()
-    by_name = {accumulator.mapped.message.name: accumulator for accumulator in codec._accumulators}
-
-    @cache
-    def accumulators(identifier: int) -> list[Accumulator]:
-        """The accumulators that frames with this identifier can add to."""
-        message = codec.origins.message(identifier)
-        names = [r.name for r in codec.mapping.requests if r.response == identifier]
-        names += [message.name] if message else []
-        return [by_name[name] for name in names if name in by_name]
-
-    for frame, passed in zip(frames.tuples(), passed_ns.tolist(), strict=True):
-        time_ns, identifier, data, channel = frame
-        codec._origin_ns = time_ns - passed  # as it was then: a clock that was set moves it
-        if _handler(codec, channel & ~TRANSMITTED, identifier)(passed, data):
-            continue
-        codec.latest[identifier] = (time_ns, data)
-        for accumulator in accumulators(identifier):
-            if window := accumulator.window():
-                for source, sample in zip(accumulator.mapped.sources, window.roles, strict=True):
-                    if sample:
-                        samples.setdefault(source.role, []).append((sample.time, sample.value))
-    codec._origin_ns = origin_ns
-    columns = {role: np.array(rows) for role, rows in samples.items()}
-    return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
 
 def _layout(message: Message, mapping: BusMapping) -> MappedMessage | None:
@@ -139,50 +438,6 @@ def _pager(message: Message, signal: Signal) -> Signal | None:
     return message.get_signal_by_name(signal.multiplexer_signal)
 
 
-def _decode_message(
-    mapped: MappedMessage, codec: Codec, identifier: int, frames: FrameColumns, passed_ns: NDArray[np.int64]
-) -> dict[str, Column]:
-    """Decode all frames of one message, at these times on the timeline of the codec: (times, values) by role."""
-    message, n, protection = mapped.message, mapped.message.length, mapped.protection
-
-    def drop(bad: Mask, place: str, reason: str) -> None:
-        if count := int(bad.sum()):
-            codec.faults[place, reason] = codec.faults.get((place, reason), 0) + count
-
-    good = frames.length == n
-    drop(~good, message.name, LENGTH)
-    data = frames.data[:, :n] if frames.data.shape[1] >= n else np.zeros((len(frames), n), np.uint8)
-    if mapped.sources and protection.crc:
-        wrong = good & ~_has_right_crc(data)
-        drop(wrong, message.name, CRC)
-        good &= ~wrong
-    if mapped.sources and protection.counter:
-        rows = np.flatnonzero(good)
-        wrong, lost = _follow_counter(mapped, data[rows], passed_ns[rows])
-        drop(wrong, message.name, COUNTER)
-        good[rows[wrong]] = False
-        if lost:
-            codec.lost[message.name] = codec.lost.get(message.name, 0) + lost
-    rows = np.flatnonzero(good)
-    if not len(rows):
-        return {}
-    codec.latest[identifier] = frames[rows[-1:]].tuples()[0][0::2]
-    data, time = data[rows], passed_ns[rows].astype(float) * 1e-9
-    found = {}
-    for source, signal, limits in zip(mapped.sources, mapped.signals, mapped.limits, strict=True):
-        raw, present = _raw(signal, data), np.ones(len(data), bool)
-        if pager := _pager(message, signal):
-            present = np.isin(_raw(pager, data), list(signal.multiplexer_ids or ()))
-        real = present & _within(raw, signal, limits)
-        missing = present & ~real & _is_code(raw, signal, mapped.not_available)
-        place = f"{source.message}.{source.signal}"
-        drop(missing, place, NOT_AVAILABLE)
-        drop(present & ~real & ~missing, place, RANGE)
-        if real.any():
-            found[source.role] = time[real], raw[real].astype(float) * source.factor + source.offset
-    return found
-
-
 def _has_right_crc(data: NDArray[np.uint8]) -> Mask:
     """Whether the last byte of each row is the CRC of the others."""
     constant, tables = sae_j1850_tables(data.shape[1] - 1)
@@ -193,8 +448,10 @@ def _has_right_crc(data: NDArray[np.uint8]) -> Mask:
     return right
 
 
-def _follow_counter(mapped: MappedMessage, data: NDArray[np.uint8], passed_ns: NDArray[np.int64]) -> tuple[Mask, int]:
-    """(mask of the frames whose counter is wrong, how many frames it shows as missing); rules as of the live codec."""
+def _follow_counter(
+    mapped: MappedMessage, data: NDArray[np.uint8], passed_ns: NDArray[np.int64]
+) -> tuple[Mask, NDArray[np.int64]]:
+    """(mask of frames whose counter is wrong, frames that it shows as missing before each); rules of the live codec."""
     assert mapped.protection.counter
     counter = mapped.message.get_signal_by_name(mapped.protection.counter)
     low, high = map(int, raw_range(counter, mapped.not_available))
@@ -208,7 +465,9 @@ def _follow_counter(mapped: MappedMessage, data: NDArray[np.uint8], passed_ns: N
     missing = np.where(since_ns < pause_ns, (counts - expected) % modulo, 0)
     far = (missing > 0) & (missing >= modulo // 2)
     wrong[rows[far]] = True
-    return wrong, int(missing[~far].sum())
+    lost = np.zeros(len(data), np.int64)
+    lost[rows] = np.where(far, 0, missing)
+    return wrong, lost
 
 
 def _raw(signal: Signal, data: NDArray[np.uint8]) -> NDArray[Any]:

@@ -56,8 +56,8 @@ def stray(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return found
 
 
-def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the frames with a plausible time: (their indices, their times on the codec's timeline [ns]).
+def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Place frames on the codec's timeline: (mask of those with a plausible time, times [ns]).
 
     The codec judges each time that does not follow the one before, and is left at the time of the last frame.
     """
@@ -75,7 +75,7 @@ def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.in
             origins[place] = codec._origin_ns or 0
             last, place = codec._last_ns, place + 1
     codec._last_ns = last
-    return np.flatnonzero(kept), (time_ns - origins)[kept]
+    return kept, time_ns - origins
 
 
 def _follow(time_ns: NDArray[np.int64], place: int, last: int, ahead_ns: int) -> tuple[int, int, int]:

@@ -27,7 +27,7 @@ from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import standing_load
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.timeline import stray
+from gz_onboard.recording.decode import feed
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -126,8 +126,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     mapping, frames = open_ride(log, vehicle)
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
     pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
-    for batch in frames[~stray(frames.time_ns)].batches():
-        pipeline.advance(batch, batch[-1][0])
+    feed(pipeline, frames)
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]

@@ -23,11 +23,11 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.events import EFF_FLAG, WINDOW, Estimate
 from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_log import EstimateTask
-from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.lab.estimate_route import RouteSummary, off_text
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, gains
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.vehicle import read_vehicle

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.events import WINDOW, Estimate
-from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.log_rows import estimate_row
 from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_log
 from gz_onboard.vehicle import read_vehicle

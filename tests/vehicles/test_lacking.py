@@ -8,11 +8,11 @@ from pathlib import Path
 
 from gz_onboard.estimator.estimator import LOSS_SD
 from gz_onboard.events import Estimate, Reason, State
-from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import lacking
+from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-from tests.support import Run, Scooter, reference
+from tests.support import Run, S, Scooter, reference
 
 NEVER_HAD = r"rate_\w|accel_\w|gps_\w+|latitude|longitude|ambient_temperature"
 
@@ -70,5 +70,6 @@ def test_a_pack_that_shows_nothing_is_still_invalid(tmp_path):
     frames = Scooter().steady(30.0, current=20.0)
     feed(run.pipeline, FrameColumns.of(frames))
     before = len(run.estimates)
-    run.pipeline.advance([], frames[-1][0] + 4_000_000_000)
+    for seconds in (4, 5):
+        run.pipeline.advance([], frames[-1][0] + seconds * S)
     assert [run.estimates[i].state for i in (before - 1, -1)] == [State.VALID, State.INVALID]  # first by the inverter's

@@ -14,8 +14,8 @@ from gz_onboard.cli import main
 from gz_onboard.daemon.command import summary
 from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import EFF_FLAG, State
-from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import Pipeline, dbc_texts
+from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import Run, Scooter, check_sound
