@@ -12,10 +12,10 @@ from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.errors import InputError, brief
 from gz_onboard.events import Frame
 from gz_onboard.lab import export_tables
+from gz_onboard.offline import write_tables
 from gz_onboard.offline.arguments import checked, within
 from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.options import LONGEST_LOG
-from gz_onboard.recording import tables
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.readers.contents import LogDamage
 
@@ -33,8 +33,8 @@ class LoggedFrames(Tabular):
 
     def to_table(self) -> Columns:
         """A row for each frame, with the columns that ``gz-onboard export --frames`` writes."""
-        columns = tables.frame_columns(FrameColumns.of(self.frames))
-        arrays = {name: np.array(column, _KINDS[tables.FRAME[name]]) for name, column in columns.items()}
+        columns = write_tables.frame_columns(FrameColumns.of(self.frames))
+        arrays = {name: np.array(column, _KINDS[write_tables.FRAME[name]]) for name, column in columns.items()}
         return {"time": _times([frame[0] for frame in self.frames]), **arrays}
 
 
@@ -112,7 +112,7 @@ def read_signals(
     found = export_tables.signals_of(source, [Path(file) for file in dbc], known)
     messages = {
         name: LoggedMessage(rows.times, {column: array_of(values) for column, values in rows.columns.items()})
-        for name, rows in tables.by_message(found.decoded).items()
+        for name, rows in write_tables.by_message(found.decoded).items()
     }
     if (decoder := found.decoder) is None:
         return LoggedSignals(messages, source.damages)

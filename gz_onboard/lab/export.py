@@ -34,10 +34,10 @@ from gz_onboard.lab.export_tables import (
     write_estimates,
     write_signals,
 )
+from gz_onboard.offline.write_logs import out_suffix, whole, write_frames_as, write_mcap
+from gz_onboard.offline.write_tables import FRAME, frame_columns, write_table
 from gz_onboard.options import add_shared
 from gz_onboard.recording import logs
-from gz_onboard.recording.export import out_suffix, whole, write_frames_as, write_mcap
-from gz_onboard.recording.tables import FRAME, frame_columns, write_table
 from gz_onboard.vehicle import read_vehicle
 
 _TABLES = (".csv", ".parquet", ".jsonl")

@@ -13,8 +13,9 @@ from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.signals import Decoded, Decoder
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC
+from gz_onboard.offline import write_tables
 from gz_onboard.offline.table import table_columns
-from gz_onboard.recording import logs, tables
+from gz_onboard.recording import logs
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.replay import log_section
@@ -113,7 +114,7 @@ def write_estimates(source: ExportSource, files: Mapping[str, Path]) -> int:
         rows = estimates if topic == ESTIMATE_TOPIC else source.rows(topic)
         table = {c: [values.get(name) for _, values in rows] for name, c in columns[topic].items() if c in wanted}
         if rows and table:
-            tables.write_table(out, table, [time_ns for time_ns, _ in rows])
+            write_tables.write_table(out, table, [time_ns for time_ns, _ in rows])
     return len(estimates)
 
 
@@ -193,13 +194,13 @@ def write_signals(source: ExportSource, out: Path, suffix: str, signals: LogSign
     """
     if suffix not in _FORMATS:
         raise InputError(f"{source.log}: its signals can be written to .csv, .parquet, .jsonl, .mcap or a directory")
-    messages = tables.by_message(signals.decoded)
+    messages = write_tables.by_message(signals.decoded)
     if suffix.startswith("/"):
         out.mkdir(parents=True, exist_ok=True)
         for message, rows in messages.items():
-            tables.write_table(out / f"{message}{suffix[1:]}", rows.columns, rows.times)
+            write_tables.write_table(out / f"{message}{suffix[1:]}", rows.columns, rows.times)
     else:
-        tables.write_long(out, messages)
+        write_tables.write_long(out, messages)
     return sum(len(rows.times) for rows in messages.values())
 
 

@@ -1,1 +1,1 @@
-"""Recorded rides: readers of log formats, decoding by columns, export and replay."""
+"""Recorded rides: readers of log formats, decoding by columns, and replay."""

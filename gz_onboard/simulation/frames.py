@@ -17,7 +17,7 @@ from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.recording.export import out_suffix, write_frames_as
+from gz_onboard.offline.write_logs import out_suffix, write_frames_as
 from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, SimulatedSensor, latency, shaken, spread
 from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle

@@ -20,8 +20,8 @@ from gz_onboard.lab.history.text import HISTORY_VERSION, overview_text
 from gz_onboard.lab.history.totals import LearnedAt, NumberedRide, Overview, Totals, overviews
 from gz_onboard.offline.results import write_json
 from gz_onboard.offline.style import picture_format, save
+from gz_onboard.offline.write_tables import write_table
 from gz_onboard.options import add_shared
-from gz_onboard.recording.tables import write_table
 
 _KINDS: dict[str, type] = {"number": int, **{name: (get_args(kind) or (kind,))[0] for name, kind in COLUMNS.items()}}
 
