@@ -44,10 +44,14 @@ RESETS = {"battery": ("learned",), "riding": ("riding",), "all": ("learned", "ri
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of the command."""
     add_shared(parser, "--vehicle", "--vehicle-id", "--json")
-    state_help = f"saved state (default: the vehicle's in {STATE_FOLDER})"
-    parser.add_argument("--state", type=Path, metavar="FILE", help=state_help)
-    reset = "forget this: `battery` after the pack was replaced, `all` for a new owner; stop the daemon first"
-    parser.add_argument("--reset", choices=tuple(RESETS), help=reset)
+    parser.add_argument(
+        "--state", type=Path, metavar="FILE", help=f"saved state (default: the vehicle's in {STATE_FOLDER})"
+    )
+    parser.add_argument(
+        "--reset",
+        choices=tuple(RESETS),
+        help="forget this: `battery` after the pack was replaced, `all` for a new owner; stop the daemon first",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -73,11 +77,22 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
+@contextmanager
+def _loaded(file: Path) -> Iterator[tuple[Mapping[str, Any], float | None]]:
+    """Load a saved state to (snapshot, age [s]). InputError, with a remedy, if it cannot be used, also within."""
+    try:
+        found = state.load(file, time.time())
+        if found is None:
+            raise ValueError("no saved state; the daemon keeps one in its state folder")
+        yield found
+    except ValueError as error:
+        raise InputError(f"{file}: {error}; choose another state file or vehicle") from error
+
+
 def read_state(file: Path, vehicle: Vehicle) -> tuple[Estimator, float | None]:
     """Restore an estimator from a saved state; also its age by the clock [s], if known. InputError if it cannot be."""
     estimator = Pipeline(vehicle).estimator
-    with _usable(file):
-        snapshot, age = _load(file)
+    with _loaded(file) as (snapshot, age):
         estimator.restore(snapshot, vehicle.key, age)
     return estimator, age
 
@@ -85,8 +100,7 @@ def read_state(file: Path, vehicle: Vehicle) -> tuple[Estimator, float | None]:
 def reset(file: Path, vehicle: Vehicle, what: str) -> None:
     """Replace parts of a saved state, one of `RESETS`, by those of a new estimator; the state gets no younger."""
     new = Pipeline(vehicle).estimator
-    with _usable(file):
-        snapshot, age = _load(file)
+    with _loaded(file) as (snapshot, age):
         check_vehicle(snapshot, vehicle.key)
     fresh = {"learned": new.learned_snapshot(), "riding": new.forecaster.snapshot()}
     changed = {**snapshot, **{part: fresh[part] for part in RESETS[what]}}
@@ -98,22 +112,6 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
         except BlockingIOError as error:
             raise InputError(f"{file}: the running daemon would overwrite it; stop it first") from error
         state.write(file, state.encode(changed, 0.0 if age is None else time.time() - age))
-
-
-def _load(file: Path) -> tuple[Mapping[str, Any], float | None]:
-    found = state.load(file, time.time())
-    if found is None:
-        raise ValueError("no saved state; the daemon keeps one in its state folder")
-    return found
-
-
-@contextmanager
-def _usable(file: Path) -> Iterator[None]:
-    """InputError, which names the `file` and a remedy, for a state that cannot be used."""
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(f"{file}: {error}; choose another state file or vehicle") from error
 
 
 def battery_learned(estimator: Estimator) -> dict[str, Learned]:
