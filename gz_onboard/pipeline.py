@@ -106,7 +106,6 @@ class Pipeline:
         self._range_due = False  # frames of a second that has ended
         self._dropped_before = self._lost_before = 0
         self._recent = Reason(0)
-        self._topics: dict[int, str] = {}
         self._positions = Positions()
         if log:
             answers = [request.message for request in vehicle.mapping.requests]
@@ -217,15 +216,9 @@ class Pipeline:
 
     def _sample_signals(self, log: Log, now: float, time_ns: int) -> None:
         """The latest signals of each message, at the time that they were seen, and the position."""
-        codec, topics = self.codec, self._topics
-        for identifier, (seen_ns, data) in codec.latest.items():
+        for name, (seen_ns, _, data, _) in self.codec.latest.items():
             if time_ns - seen_ns < WINDOWS_PER_RANGE * WINDOW_NS:  # not again what was logged before
-                topic = topics.get(identifier)
-                if topic is None:
-                    if (name := codec.message_name(identifier)) is None:  # a frame of an answer
-                        continue
-                    topic = topics[identifier] = f"/can/{name}"
-                log.sample(topic, time_ns, codec.values(identifier, data), seen_ns)
+                log.sample(f"/can/{name}", time_ns, self.codec.values(name, data), seen_ns)
         if found := self._positions.new(self.estimator.signals, now, time_ns):
             seen_ns, row = found
             log.sample(LOCATION_TOPIC, time_ns, row, seen_ns)

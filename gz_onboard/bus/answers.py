@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from gz_onboard.bus.requests import Request
+from gz_onboard.events import Frame
 
 # Why an answer was dropped
 SEQUENCE = "answer with frames missing or out of order"
@@ -79,30 +80,21 @@ class Assembler:
         self._length, self._skips = 0, True
 
 
-Take = Callable[[float, bytes], object]
-"""Takes the time [s] and the bytes behind the data identifier."""
-
-
 class AnswerReader:
-    """Gives each answer on one identifier to the one of `takers` at the place of its request in `requests`.
+    """Finds the answers to `requests`, all on one identifier. fault: counts (identifier, reason)."""
 
-    fault: counts (message, reason).
-    """
-
-    def __init__(self, requests: Sequence[Request], takers: Sequence[Take], fault: Callable[[str, str], None]) -> None:
-        addresses, self._place = requests[0].addresses, f"{requests[0].response & 0x1FFFFFFF:#x}"
-        self._fault = fault
+    def __init__(self, requests: Sequence[Request], fault: Callable[[str, str], None]) -> None:
+        self.inbox: list[Frame] = []
+        self._requests, self._fault = requests, fault
+        self._place, addresses = f"{requests[0].response & 0x1FFFFFFF:#x}", requests[0].addresses
         self._assembler = Assembler(addresses[1] if addresses else None, lambda reason: fault(self._place, reason))
-        self._takers = {request.prefix: take for request, take in zip(requests, takers, strict=True)}
 
-    def take(self, time: float, data: bytes) -> None:
-        """Take the frame `data` of `time` [s]."""
+    def take(self, time: float, data: bytes) -> list[tuple[Request, bytes]]:
+        """The request and the bytes behind its data identifier if the frame of `time` [s] completes an answer."""
         payload = self._assembler.take(time, data) or b""
         if payload[:1] == bytes([NEGATIVE_RESPONSE]) and payload[2:3] and payload[2] != PENDING:
             self._fault(self._place, f"{NEGATIVE} {payload[2]:#04x}")
-        for prefix, take in self._takers.items():
-            if payload.startswith(prefix):
-                take(time, payload[len(prefix) :])
+        return [(one, payload[len(one.prefix) :]) for one in self._requests if payload.startswith(one.prefix)]
 
 
 def by_response(requests: Sequence[Request]) -> dict[int, list[Request]]:

@@ -1,28 +1,25 @@
-"""Decode CAN frames and accumulate their signals, through a cantools database compiled once.
+"""Decode CAN frames into windows of the roles that their signals play.
 
-A frame costs a check and an addition: its raw values go into sums, which `Codec.windows` scales and hands over about
-twice a second.
+A frame costs a look-up and an append: the frames of each message are kept until the window ends, about twice a second,
+and are then checked and decoded together.
 
-Whole frame or nothing: what fails a check is dropped, counted by message and reason, and never becomes a
+Whole frame or nothing: a frame that fails a check is dropped, counted by message and reason, and never becomes a
 number. Nothing here raises on whatever the bus brings.
-
-Each mapped message becomes a function generated from its layout in the database: one ``struct`` call, shifts and
-masks take 0.4 µs where ``decode_message`` takes 4. A test holds both equal over random frames and random layouts;
-multiplexed and floating-point signals go through cantools itself.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Sequence
+from math import isnan
+from operator import itemgetter
+from typing import TYPE_CHECKING
 
-from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, Take, by_response
-from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
+from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, by_response
+from gz_onboard.bus.checksum import crc_differences
+from gz_onboard.bus.layout import Column, Layout, identifier_of, is_not_available, plausible_range, raw_range
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
-from gz_onboard.bus.origins import RECENT, Origins
+from gz_onboard.bus.origins import Origin, Origins
 from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
 from gz_onboard.events import (
@@ -47,122 +44,189 @@ COUNTER = "counter jump"
 NOT_AVAILABLE = "not available"
 RANGE = "out of range"
 TIME = "implausible time"
-UNDECODABLE = "undecodable"
 CONFLICT = "different data from two channels or senders"
-DROPPING = (
-    LENGTH,
-    CRC,
-    COUNTER,
-    TIME,
-    UNDECODABLE,
-    CONFLICT,
-    SEQUENCE,
-    INTERRUPTED,
-    MALFORMED,
-)  # that drop a frame or an answer
+DROPPING = (LENGTH, CRC, COUNTER, TIME, CONFLICT, SEQUENCE, INTERRUPTED, MALFORMED)  # that drop a frame or an answer
 
-SILENT = 2.0  # s: a message's own place that sends nothing for so long, and ten periods, has fallen silent
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 AHEAD_NS = 30_000_000_000
 LONGEST_PAUSE_NS = 30 * 86_400 * 1_000_000_000
 """Of a log: a leap ahead by more is a clock that was set. A live bus may be silent for as long as it likes."""
-_MOST_LEAPS = 100  # are remembered
+PAUSE = 1.0  # s: after it any counter goes, where the period of a message is not known
 CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
-_MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
-
-Handler = Callable[[int, bytes], bool | None]
-"""Takes the time [ns, on the codec's timeline] and data of a frame; True if the frame was dropped."""
-Drained = tuple[int, int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-"""Frames, time of the last [ns], and of each signal the last raw value, the sum, and the sum of squares."""
+MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
+_MOST_LEAPS = 100  # are remembered
+_IDENTIFIER = itemgetter(1)
 
 
-@dataclass(slots=True)
-class Spill:
-    """Valid samples of one signal from frames in which another signal was missing or not valid; raw values."""
+class MessageDecoder:
+    """Checks and decodes the frames of one message, or the answers to one request, a batch at a time.
 
-    count: int = 0
-    time: int = -1  # ns
-    value: float = 0.0
-    total: float = 0.0
-    square: float = 0.0
-
-    def add(self, time: int, value: float) -> None:
-        """Take a raw value at `time` [ns]."""
-        self.time, self.value, self.count = time, value, self.count + 1
-        self.total += value
-        self.square += value * value
-
-
-class Accumulator:
-    """Samples of one message since the last window.
-
-    fault: counts (place, reason).
+    origin: chooses among the places that frames come from; None for answers. not_available: whether all ones mean that.
+    limits: the least and the greatest raw value of each of `signals` that is taken for real.
     """
 
-    def __init__(self, mapped: MappedMessage, group: int, fault: Callable[[str, str], None]) -> None:
-        self.mapped, self.group, self._fault = mapped, group, fault
-        self.drain: Callable[[], Drained]
-        self._spilled = 0  # frames
-        self._spill_time = -1  # ns
-        self._spills = [Spill() for _ in mapped.sources]
+    def __init__(
+        self, codec: Codec, message: Message, sources: list[Source], origin: Origin | None, not_available: bool
+    ) -> None:
+        self.inbox: list[Frame] = []
+        self.is_sole = True  # whether all frames come from the message's own place
+        self.message, self.name, self.sources, self.origin = message, message.name, sources, origin
+        self.not_available, self._codec = not_available, codec
+        self.group = len(codec.groups) if sources else None
+        self.protection = codec.mapping.protection.get(self.name, Protection()) if sources else Protection()
+        period = codec.mapping.periods.get(self.name)
+        if sources:
+            codec.groups.append(Group(self.name, tuple(source.role for source in sources), period))
+        self.signals = [message.get_signal_by_name(source.signal) for source in sources]
+        self.limits = [
+            plausible_range(source, *raw_range(signal, not_available))
+            for source, signal in zip(sources, self.signals, strict=True)
+        ]
+        self._layout = Layout(message, self.signals)
+        self._roles = [
+            (*limits, source.factor, source.offset, source.role in SQUARED)
+            for source, limits in zip(sources, self.limits, strict=True)
+        ]
+        counter = [message.get_signal_by_name(self.protection.counter)] if self.protection.counter else []
+        self._counter = Layout(message, counter)
+        self.counts = tuple(map(int, raw_range(counter[0], not_available))) if counter else (0, 0)
+        self._following: float = self.counts[0]
+        self._seen_ns = -1 << 80
+        self.pause_ns = round((STALE_PERIODS * period if period else PAUSE) * 1e9)  # after it any counter goes
 
-    def spill(self, time: int, raw: Sequence[float | None]) -> None:
-        """Take a frame at `time` [ns] in which some raw values are absent or not within their limits."""
-        self._spilled, self._spill_time, mapped = self._spilled + 1, time, self.mapped
-        for spill, source, signal, (low, high), value in zip(
-            self._spills, mapped.sources, mapped.signals, mapped.limits, raw, strict=True
-        ):
-            if value is not None and low <= value <= high:  # False for NaN
-                spill.add(time, value)
-            elif value is not None:
-                absent = mapped.not_available and is_not_available(signal, value)
-                self._fault(f"{source.message}.{source.signal}", NOT_AVAILABLE if absent else RANGE)
-
-    def spill_undecoded(self, time: int, data: bytes) -> bool | None:
-        """Take a frame at `time` [ns] that cantools has to decode; True if it cannot."""
-        values = raw_values(self.mapped.message, data)
-        if values is None:
-            self._fault(self.mapped.message.name, UNDECODABLE)
-            return True
-        raw = [values.get(source.signal) for source in self.mapped.sources]  # absent: another multiplexed branch
-        if any(value is not None for value in raw):
-            self.spill(time, raw)
-        return None
-
-    def window(self) -> MessageWindow | None:
-        """The samples since the last call; None if no frame came."""
-        n, last, values, sums, squares = self.drain()
-        if not n and not self._spilled:
+    def window(self, origin_ns: int) -> MessageWindow | None:
+        """The samples of the frames in the inbox, which is emptied. origin_ns: where the timeline begins."""
+        frames = self.inbox.copy()
+        self.inbox.clear()
+        if not self.is_sole:
+            frames = self._from_own_place(frames, origin_ns)
+        elif self.origin:
+            self.origin.last = frames[-1], origin_ns
+        if frames:
+            frames, data = self._right(frames, origin_ns)
+        if not frames:
             return None
+        self._codec.latest[self.name] = frames[-1]
+        return self._decode(frames, data, origin_ns) if self._roles else None
+
+    def _from_own_place(self, frames: Sequence[Frame], origin_ns: int) -> list[Frame]:
+        own, origin = [], self.origin
+        assert origin
+        for frame in frames:
+            time_ns, identifier, data, channel = frame
+            is_own = origin.takes(time_ns - origin_ns, channel, identifier, data)
+            if origin.conflict:
+                self._codec.count_fault(self.name, CONFLICT)
+            elif is_own:
+                own.append(frame)
+            else:
+                self._codec.copies += 1
+        return own
+
+    def _right(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
+        """Those of `frames` whose length, checksum and counter are right, and the data of all of them."""
+        length, protection, count_fault = self.message.length, self.protection, self._codec.count_fault
+        parts = [frame[2] for frame in frames]
+        if set(map(len, parts)) != {length}:
+            wrong = [len(part) for part in parts if len(part) != length]
+            count_fault(self.name, LENGTH, len(wrong))
+            if self.origin is None:
+                self._codec.wrong_lengths[self.name] = wrong[-1]
+            frames = [frame for frame in frames if len(frame[2]) == length]
+            parts = [frame[2] for frame in frames]
+        data = b"".join(parts)
+        if protection.crc:
+            differences = crc_differences(data, length)
+            if any(differences):
+                frames = [frame for frame, difference in zip(frames, differences, strict=True) if not difference]
+                count_fault(self.name, CRC, len(differences) - len(frames))
+                data = b"".join([frame[2] for frame in frames])
+        if protection.counter and frames:
+            right = self._follow_counter(frames, data, origin_ns)
+            if len(right) < len(frames):
+                count_fault(self.name, COUNTER, len(frames) - len(right))
+                frames, data = right, b"".join([frame[2] for frame in right])
+        return frames, data
+
+    def _follow_counter(self, frames: list[Frame], data: bytes, origin_ns: int) -> list[Frame]:
+        """Those of `frames` whose counter is right, as of AUTOSAR's E2E.
+
+        A repeated or far-off counter is wrong, a small step shows lost frames; after a pause any value is taken.
+        """
+        (low, high), right, lost = self.counts, [], 0
+        counts = self._counter.columns(data, len(frames))[0]
+        expected = [self._following, *(count + 1 if count < high else low for count in counts)]
+        if list(counts) == expected[:-1]:
+            self._following, self._seen_ns = expected[-1], frames[-1][0] - origin_ns
+            return frames
+        for frame, count in zip(frames, counts, strict=True):
+            missing, time_ns = 0, frame[0] - origin_ns
+            if count != self._following:
+                if not low <= count <= high:
+                    continue
+                if time_ns - self._seen_ns < self.pause_ns:
+                    missing = int(count - self._following) % (high - low + 1)
+            self._following, self._seen_ns = count + 1 if count < high else low, time_ns
+            if not missing or missing < (high - low + 1) // 2:
+                right.append(frame)
+                lost += missing
+        if lost:
+            self._codec.lost[self.name] = self._codec.lost.get(self.name, 0) + lost
+        return right
+
+    def _decode(self, frames: Sequence[Frame], data: bytes, origin_ns: int) -> MessageWindow | None:
+        columns, count = self._layout.columns(data, len(frames)), len(frames)
+        last_ns = frames[-1][0] - origin_ns
+        all_rows = (
+            [self._layout.rows(place, columns) for place in range(len(self._roles))] if self._layout.is_paged else ()
+        )
+        if all_rows and None not in all_rows:  # a frame of another page counts for nothing
+            seen = sorted({row for rows in all_rows for row in rows or ()})
+            if not seen:
+                return None
+            last_ns, count = frames[seen[-1]][0] - origin_ns, len(seen)
         roles: list[RoleWindow | None] = []
-        square = iter(squares)
-        for i, (source, spill) in enumerate(zip(self.mapped.sources, self._spills, strict=True)):
-            squared = source.role in SQUARED
-            total, raw, time = (sums[i], values[i], last) if n else (0, 0.0, -1)
-            square_total = next(square) if squared and n else 0
-            count, scale, offset = n + spill.count, source.factor, source.offset
-            if spill.count:
-                total, square_total = total + spill.total, square_total + spill.square
-                if spill.time >= time:
-                    time, raw = spill.time, spill.value
-            if not count:
+        for place, (low, high, scale, offset, is_squared) in enumerate(self._roles):
+            values, time_ns, rows = columns[place], last_ns, all_rows[place] if all_rows else None
+            if rows is not None:
+                values = [values[row] for row in rows]
+            total = sum(values)
+            if values and not (low <= min(values) and max(values) <= high and not isnan(total)):
+                rows = self._physical(place, columns[place], range(len(frames)) if rows is None else rows)
+                values = [columns[place][row] for row in rows]
+                total = sum(values)
+            if not values:
                 roles.append(None)
                 continue
-            mean = total / count
-            mean_square = scale * scale * square_total / count + offset * (2 * scale * mean + offset)
-            roles.append(
-                RoleWindow(
-                    time * 1e-9, raw * scale + offset, count, mean * scale + offset, mean_square if squared else None
-                )
-            )
-        time, count = max(last if n else -1, self._spill_time if self._spilled else -1), n + self._spilled
-        if self._spilled:
-            self._spilled, self._spills = 0, [Spill() for _ in self._spills]
-        return MessageWindow(self.group, time * 1e-9, count, tuple(roles))
+            if rows is not None:
+                time_ns = frames[rows[-1]][0] - origin_ns
+            samples, mean_square = len(values), None
+            mean = total / samples
+            if is_squared:
+                square = sum([value * value for value in values])
+                mean_square = scale * scale * square / samples + offset * (2 * scale * mean + offset)
+            value = values[-1] * scale + offset
+            roles.append(RoleWindow(time_ns * 1e-9, value, samples, mean * scale + offset, mean_square))
+        return MessageWindow(self.group or 0, last_ns * 1e-9, count, tuple(roles))
+
+    def _physical(self, place: int, column: Column, rows: Sequence[int]) -> list[int]:
+        """Those of `rows` whose value is within its limits; the others are counted."""
+        signal, (low, high) = self.signals[place], self.limits[place]
+        kept = []
+        for row in rows:
+            if low <= column[row] <= high:  # False for NaN
+                kept.append(row)
+            else:
+                absent = self.not_available and is_not_available(signal, column[row])
+                self._codec.count_fault(f"{self.name}.{signal.name}", NOT_AVAILABLE if absent else RANGE)
+        return kept
 
 
 class Codec:
-    """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts."""
+    """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts.
+
+    All counts but `received` are those at the last call of `windows`.
+    """
 
     def __init__(self, mapping: BusMapping, longest_pause_ns: int | None = None) -> None:
         self.mapping = mapping
@@ -176,65 +240,96 @@ class Codec:
         self.copies = 0  # frames of known messages from another channel or sender than they are taken from
         self.error_frames = 0
         self.received = 0
-        self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
-        # Likewise, below zero, of the last good answer to a request: -1 for the first request, and so on.
-        self.wrong_lengths: dict[str, int] = {}  # message of an answer -> bytes of the last that has another length
-        self._accumulators: list[Accumulator] = []
+        self.latest: dict[str, Frame] = {}  # message or request -> the last good frame, or answer
+        self.wrong_lengths: dict[str, int] = {}  # request -> bytes of the last answer that has another length
         self._origin_ns: int | None = None
-        self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
         self._last_ns = -(1 << 80)  # before any frame: far from every time
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
         self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion
-        self.origins = Origins(mapping)
-        self._own_times: dict[str, int] = {}  # ns, of the last frame of messages that are heard elsewhere as well
-        self._handlers: dict[int, dict[int, Handler]] = {}  # by channel and identifier, of what was heard
-        self._channel, self._room = -1, _MOST_IDENTIFIERS  # of the last frame; further handlers to keep
-        self._decoders: dict[str, Handler] = {}
-        self._mapped = {source.message for source in mapping.sources}
-        by_message: dict[str, list[Source]] = {}
+        self._ready: list[MessageWindow] = []  # from before the clock was set
+        self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
+        self._channel = 0  # of the last frame
+        self._inboxes: dict[int, dict[int, list[Frame]]] = {0: {}}  # by channel and identifier, of what was heard
+        self._errors: list[Frame] = []
+        self._strangers: list[Frame] = []  # that no DBC file has
+        self._copies: list[Frame] = []  # of answers
+        self._questions: list[Frame] = []
+        sources: dict[str, list[Source]] = {}
         for source in mapping.sources:
-            by_message.setdefault(source.message, []).append(source)
-        for message in mapping.database.messages:
-            self._decoders[message.name] = self._handler(message, by_message.get(message.name, []))
-        self._answers = self._answer_handlers(by_message)
+            sources.setdefault(source.message, []).append(source)
+        self.origins = Origins(mapping, sources)
+        self.decoders = {
+            origin.message.name: MessageDecoder(
+                self, origin.message, sources.get(origin.message.name, []), origin, mapping.not_available
+            )
+            for origin in self.origins
+        }
+        responses = by_response(mapping.requests)
+        self._answers = {response: AnswerReader(those, self.count_fault) for response, those in responses.items()}
         self._answering: dict[int, int] = {}  # channel by identifier of an answer: the first, as a gateway may copy it
+        for request in (request for those in responses.values() for request in those):
+            # All ones are a value: what limits are for.
+            decoder = MessageDecoder(self, request.message, sources.get(request.name, []), None, False)
+            self.decoders[request.name] = decoder
+        self.asked = {*FUNCTIONAL, *(request.request for request in mapping.requests)} if mapping.requests else set()
 
     # --- frames ---------------------------------------------------------------------------------------------
 
-    def decode(self, frames: Iterable[Frame]) -> None:
-        """Decode `frames` and add their values to the window. Times are since the first frame ever decoded."""
-        latest, heard = self.latest, self._channel
-        handlers = self._handlers.setdefault(heard & ~TRANSMITTED, {})
-        origin, last = self._origin_ns, self._last_ns
-        back, ahead = -BACK_NS, AHEAD_NS
-        count = 0
-        for time_ns, identifier, data, channel in frames:
-            count += 1
-            step = time_ns - last
-            if step < 0 or step > ahead:
-                if step < back or step > ahead:
-                    self._last_ns = last
-                    if not self._retime(time_ns):
-                        continue
-                    origin, last = self._origin_ns, self._last_ns
-            else:
-                last = time_ns
-            if channel != heard:
-                heard, handlers = channel, self._handlers.setdefault(channel & ~TRANSMITTED, {})
+    def decode(self, frames: Sequence[Frame]) -> None:
+        """Take `frames` in for the window. Times are since the first frame ever decoded."""
+        heard, inboxes, last = self._channel, self._inboxes[self._channel], self._last_ns
+        self.received += len(frames)
+        for frame in frames:
+            step = frame[0] - last
+            if 0 <= step <= AHEAD_NS:
+                last = frame[0]
+            elif not -BACK_NS <= step < 0:
+                self._last_ns = last
+                if not self._retime(frame[0]):
+                    continue
+                last = self._last_ns
+            if frame[3] != heard:
+                heard = frame[3]
+                inboxes = self._inboxes.setdefault(heard, {})
             try:
-                handler = handlers[identifier]
+                inboxes[frame[1]].append(frame)
             except KeyError:
-                handler = self._first_heard(channel & ~TRANSMITTED, identifier)
-            if handler(time_ns - origin, data):  # type: ignore[operator]
-                continue
-            latest[identifier] = (time_ns, data)
+                self.inbox(heard, frame[1]).append(frame)
         self._last_ns, self._channel = last, heard
-        self.received += count
+
+    def take_at(self, frame: Frame, passed_ns: int) -> None:
+        """Take in a frame at this time on the timeline."""
+        self.begin_at(frame[0] - passed_ns)
+        self.inbox(frame[3], frame[1]).append(frame)
+
+    def begin_at(self, origin_ns: int | None) -> None:
+        """Let the timeline begin at this time of the frames' clock, as it is set now."""
+        if origin_ns != self._origin_ns:
+            self._ready += self._settle()
+            self._origin_ns = origin_ns
 
     def windows(self) -> list[MessageWindow]:
         """The values of each message since the last call, of those that came."""
-        return [window for accumulator in self._accumulators if (window := accumulator.window())]
+        windows, self._ready = self._ready + self._settle(), []
+        return windows
+
+    def _settle(self) -> list[MessageWindow]:
+        """Check, decode and count the frames that wait."""
+        self.error_frames += len(self._errors)
+        self.copies += len(self._copies)
+        for identifier, count in Counter(map(_IDENTIFIER, self._strangers)).items():
+            self.count_unknown(identifier, count)
+        for waiting in (self._errors, self._copies, self._strangers, self._questions):
+            waiting.clear()
+        origin_ns = self._origin_ns or 0
+        for reader in self._answers.values():
+            for time_ns, identifier, data, channel in reader.inbox:
+                for request, answer in reader.take((time_ns - origin_ns) * 1e-9, data):
+                    self.decoders[request.name].inbox.append((time_ns, identifier, answer, channel))
+            reader.inbox.clear()
+        decoders = self.decoders.values()
+        return [window for decoder in decoders if decoder.inbox and (window := decoder.window(origin_ns))]
 
     @property
     def started(self) -> bool:
@@ -262,7 +357,7 @@ class Codec:
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
         if self._origin_ns is not None:
-            self._origin_ns += delta_ns
+            self.begin_at(self._origin_ns + delta_ns)
             self._last_ns += delta_ns
 
     def _retime(self, time_ns: int) -> bool:
@@ -279,203 +374,63 @@ class Codec:
         self._suspects = self._suspects + 1 if follows and self._suspects else 1
         self._suspect_ns, self._before_ns = time_ns, self._last_ns
         if self._suspects < CONFIRM:
-            self._fault("", TIME)
+            self.count_fault("", TIME)
             return False
         self._suspects = 0
         leap = time_ns - self._last_ns
         if leap < 0 or (self.longest_pause_ns is not None and leap > self.longest_pause_ns):
             if len(self.leaps) < _MOST_LEAPS:
                 self.leaps.append((self.seconds(self._last_ns), leap * 1e-9))
-            self._origin_ns += leap
+            self.begin_at(self._origin_ns + leap)
         self._last_ns = time_ns
         return True
 
-    def _first_heard(self, channel: int, identifier: int) -> Handler:
-        """The handler of frames with this identifier on this channel; kept for the next of them while there is room."""
-        message = None if identifier & (ERR_FLAG | RTR_FLAG) else self.origins.message(identifier)
-        handler: Handler
+    # --- where frames go --------------------------------------------------------------------------------------
+
+    def inbox(self, channel: int, identifier: int) -> list[Frame]:
+        """Where frames with this identifier on this channel wait; remembered while there is room."""
+        place = channel & ~TRANSMITTED
+        origin = None if identifier & (ERR_FLAG | RTR_FLAG) else self.origins.find(identifier)
         if identifier & ERR_FLAG:
-            handler = self._count_error
+            inbox = self._errors
         elif identifier in self._answers:
-            first = self._answering.setdefault(identifier, channel) == channel
-            handler = self._answers[identifier] if first else self._count_copy
-        elif message is None:
-            handler = self._count_unknown(identifier) if self._room else self._count_others
-        elif self.origins.claim(message, channel, identifier):
-            handler = self._own(message, channel, identifier)
+            is_first = self._answering.setdefault(identifier, place) == place
+            inbox = self._answers[identifier].inbox if is_first else self._copies
+        elif identifier in self.asked:
+            inbox = self._questions
+        elif origin:
+            decoder = self.decoders[origin.message.name]
+            decoder.is_sole, inbox = origin.hear(place, identifier), decoder.inbox
         else:
-            handler = self._elsewhere(message, channel, identifier)
-        if self._room or (message and identifier == identifier_of(message)):
-            self._room = max(self._room - 1, 0)
-            self._handlers[channel][identifier] = handler
-        elif message:  # used, but not kept as the latest of its identifier
-            return lambda time, data: handler(time, data) or True
-        return handler
-
-    def _own(self, message: Message, channel: int, identifier: int) -> Handler:
-        """The handler where `message` is taken from. It may replace another place, which is then looked at anew."""
-        for heard, handlers in self._handlers.items():
-            for other in [i for i in handlers if self._is(message, i) and not self.origins.claim(message, heard, i)]:
-                del handlers[other]
-                self._room += 1
-        decode = self._decoders[message.name]
-        if message.name not in self.origins.recent:
-            return decode
-
-        def handler(time: int, data: bytes) -> bool | None:
-            self.origins.own(message.name, data)
-            self._own_times[message.name] = time
-            return decode(time, data)
-
-        return handler
-
-    def _is(self, message: Message | None, identifier: int) -> bool:
-        return not identifier & (ERR_FLAG | RTR_FLAG) and self.origins.message(identifier) is message
+            inbox = self._strangers
+        inboxes = self._inboxes.setdefault(channel, {})
+        if len(inboxes) < MOST_IDENTIFIERS:
+            inboxes[identifier] = inbox
+        return inbox
 
     def heard(self, name: str) -> list[tuple[int, int]]:
         """(channel, identifier) of all frames of a message that were heard, also where it is not taken from."""
-        message = next((m for m in self.mapping.database.messages if m.name == name), None)
-        return [(channel, i) for channel, known in self._handlers.items() for i in known if self._is(message, i)]
+        inbox = self.decoders[name].inbox
+        found = [(c & ~TRANSMITTED, i) for c, known in self._inboxes.items() for i in known if known[i] is inbox]
+        return sorted(set(found))
 
-    def _elsewhere(self, message: Message, channel: int, identifier: int) -> Handler:
-        """The handler of frames that are not from where `message` is taken: left out, or a contradiction."""
-        name, origins = message.name, self.origins
-        if name not in self._mapped:
-            return self._count_copy
-        recent = origins.recent.setdefault(name, deque(maxlen=RECENT))
-        for heard, handlers in self._handlers.items():  # from now on its own frames are kept, to be compared
-            for own in [i for i in handlers if self._is(message, i) and origins.claim(message, heard, i)]:
-                handlers[own] = self._own(message, heard, own)
-                time_ns, data = self.latest.get(own, (0, b""))
-                recent.append(data)
-                self._own_times[name] = time_ns - (self._origin_ns or 0)
-        stale = 1e9 * max(SILENT, STALE_PERIODS * self.mapping.periods.get(name, 0.0))  # ns
+    def count_unknown(self, identifier: int, count: int) -> None:
+        """Count frames with an identifier that no DBC file has."""
+        if identifier in self.unknown or len(self.unknown) < MOST_IDENTIFIERS:
+            self.unknown[identifier] = self.unknown.get(identifier, 0) + count
+        else:
+            self.unknown_others += count
 
-        def contradicted(_time: int, _data: bytes) -> bool:
-            self._fault(name, CONFLICT)
-            return True
+    def count_fault(self, place: str, reason: str, count: int = 1) -> None:
+        """Count frames of a message, or values of a signal, that were dropped."""
+        self.faults[place, reason] = self.faults.get((place, reason), 0) + count
 
-        def handler(time: int, data: bytes) -> bool:
-            silent = time - self._own_times.get(name, time) > stale
-            if silent and origins.take_over(message, channel, identifier):
-                for handlers in self._handlers.values():
-                    for known in [i for i in handlers if self._is(message, i)]:
-                        del handlers[known]
-                        self._room += 1
-                return self._count_copy(time, data)
-            if origins.differs(message, channel, identifier, data, silent):
-                for handlers in self._handlers.values():
-                    handlers.update({i: contradicted for i in handlers if self._is(message, i)})
-                return contradicted(time, data)
-            return self._count_copy(time, data)
-
-        return handler
-
-    def _count_copy(self, _time: int, _data: bytes) -> bool:
-        self.copies += 1
-        return True
-
-    def _count_error(self, _time: int, _data: bytes) -> bool:
-        self.error_frames += 1
-        return True
-
-    def _count_others(self, _time: int, _data: bytes) -> bool:
-        self.unknown_others += 1
-        return True
-
-    def _count_unknown(self, identifier: int) -> Handler:
-        unknown = self.unknown
-
-        def handler(_time: int, _data: bytes) -> bool:
-            unknown[identifier] = unknown.get(identifier, 0) + 1
-            return True
-
-        return handler
-
-    def _fault(self, message: str, reason: str) -> None:
-        key = (message, reason)
-        self.faults[key] = self.faults.get(key, 0) + 1
-
-    # --- what is known of a message ---------------------------------------------------------------------------
-
-    def values(self, identifier: int, data: bytes) -> Values:
-        """Every signal of a frame in the units of the DBC, see `MessageSignals.values`; none of an unknown frame."""
-        message = self._message(identifier)
-        if message is None:
-            return {}
-        if (signals := self._signals.get(message.name)) is None:
-            not_available = self.mapping.not_available and identifier >= 0
-            self._signals[message.name] = signals = MessageSignals(message, not_available)
+    def values(self, name: str, data: bytes) -> Values:
+        """Every signal of a message or an answer in the units of the DBC, see `MessageSignals.values`."""
+        if (signals := self._signals.get(name)) is None:
+            decoder = self.decoders[name]
+            self._signals[name] = signals = MessageSignals(decoder.message, decoder.not_available)
         return signals.values(data) or {}
-
-    def message_name(self, identifier: int) -> str | None:
-        """The name of the message with this identifier."""
-        message = self._message(identifier)
-        return message.name if message else None
-
-    def _message(self, identifier: int) -> Message | None:
-        return self.mapping.requests[-identifier - 1].message if identifier < 0 else self.origins.message(identifier)
-
-    # --- compiling ----------------------------------------------------------------------------------------------
-
-    def _answer_handlers(self, by_message: dict[str, list[Source]]) -> dict[int, Handler]:
-        """The handlers of the frames of requests and answers."""
-        requests = self.mapping.requests
-        asked = {*FUNCTIONAL, *(request.request for request in requests)} if requests else ()
-        handlers: dict[int, Handler] = dict.fromkeys(asked, lambda _time, _data: True)
-        for response, those in by_response(requests).items():
-            takers = [self._answer(-1 - requests.index(one), by_message.get(one.name, [])) for one in those]
-            answers = AnswerReader(those, takers, self._fault)
-            handlers[response] = lambda time, data, answers=answers: answers.take(time * 1e-9, data)  # type: ignore[misc]
-        return handlers
-
-    def _answer(self, key: int, sources: list[Source]) -> Take:
-        """What takes the data of the answer whose `latest` is that of `key`."""
-        message = self.mapping.requests[-1 - key].message
-        decode = self._handler(message, sources, not_available=False)  # all ones are a value: what limits are for
-
-        def take(seconds: float, data: bytes) -> None:
-            time = round(seconds * 1e9)
-            if len(data) != message.length:
-                self.wrong_lengths[message.name] = len(data)
-            if not decode(time, data) and self._origin_ns is not None:
-                self.latest[key] = (self._origin_ns + time, data)
-
-        return take
-
-    def _handler(self, message: Message, sources: list[Source], not_available: bool | None = None) -> Handler:
-        if not sources:
-            return self._check_length_only(message)
-        mapping, name = self.mapping, message.name
-        protection = mapping.protection.get(name, Protection())
-        codes = mapping.not_available if not_available is None else not_available
-        mapped = MappedMessage(message, sources, protection, mapping.periods.get(name), codes)
-        group = len(self.groups)
-        self.groups.append(Group(name, tuple(source.role for source in sources), mapped.period))
-        accumulator = Accumulator(mapped, group, self._fault)
-        self._accumulators.append(accumulator)
-        scope: dict[str, Any] = {"LENGTH": LENGTH, "CRC": CRC, "COUNTER": COUNTER}
-        exec(compile(mapped.source(), f"<layout of {name}>", "exec"), scope)
-        spill = accumulator.spill if mapped.plain else accumulator.spill_undecoded
-        constant, tables = sae_j1850_tables(message.length - 1) if protection.crc else (0, [])
-        handler: Handler
-        handler, accumulator.drain = scope["make"](self, spill, *([constant, *tables] if protection.crc else []))
-        return handler
-
-    def _check_length_only(self, message: Message) -> Handler:
-        name, length = message.name, message.length
-
-        def handler(_time: int, data: bytes) -> bool | None:
-            if len(data) == length:
-                return None
-            self._fault(name, LENGTH)
-            return True
-
-        return handler
-
-    def _jumped(self, message: str, lost: int) -> None:
-        """Count the `lost` frames that a message's counter shows as missing."""
-        self.lost[message] = self.lost.get(message, 0) + lost
 
 
 def known_identifiers(mapping: BusMapping) -> list[int] | None:

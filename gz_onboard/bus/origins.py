@@ -2,121 +2,140 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from dataclasses import dataclass
+from collections import defaultdict, deque
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
+from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.mapping import BusMapping, pgn
-from gz_onboard.events import EFF_FLAG, RTR_FLAG, hexadecimal
+from gz_onboard.events import EFF_FLAG, RTR_FLAG, STALE_PERIODS, TRANSMITTED, Frame, hexadecimal
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
 
 Place = tuple[int, int]
 """Channel, and the sender's address of a J1939 message, else the identifier with its flag."""
-RECENT = 8  # frames: a gateway's copy comes no later, and so many in a row must differ
+RECENT = 8  # frames: a gateway's copy comes no later, and this many in a row must differ
+SILENT_S = 2.0  # a place that sends nothing for this long, and ten periods, has fallen silent
 
 
-@dataclass(slots=True)
-class _Elsewhere:
-    """Frames of a message from another place than its own."""
+class Origin:
+    """Chooses the place that the frames of one message are taken from.
 
-    own_frames: int  # of the message's own place, when the last of these came
-    unmatched: bytes | None = None  # the data of the last, if the own place has not sent the same
-    differing: int = 0  # in a row
-    is_copy: bool = False  # it sent the same while the own place did
+    The vehicle file may name it by ``channel`` and ``sender``; otherwise it is the sender in the DBC file once that is
+    heard, else the first place heard. Frames from other places are left out. Where nothing says which is meant, they
+    are compared: a place that sends the same data is a copy, as a gateway makes it, and takes over when the own place
+    falls silent; `RECENT` frames in a row with other data than the own place sent are a `conflict`.
+    """
+
+    def __init__(self, message: Message, mapping: BusMapping, has_address: bool, is_compared: bool) -> None:
+        self.message = message
+        self.conflict = ""  # the contradiction and its remedy
+        self.last: tuple[Frame, int] | None = None
+        """The last frame, and where the timeline began [ns], while `hear` returned True: `takes` was not called."""
+        self._has_address, self._is_compared = has_address, is_compared
+        self._channel, self._wanted = mapping.origins.get(message.name, (None, None))
+        self._sender = message.frame_id & 0xFF if self._wanted is None else self._wanted
+        self._stale_ns = 1e9 * max(SILENT_S, STALE_PERIODS * mapping.periods.get(message.name, 0.0))
+        self._places: set[Place] = set()  # heard
+        self._own: Place | None = None
+        self._own_ns = 0
+        self._turn = 0  # frames of the own place
+        self._turns: dict[Place, int] = {}  # the own place's at the last frame from elsewhere
+        self._recent: dict[Place, deque[bytes]] = defaultdict(lambda: deque(maxlen=RECENT))
+        # Data of the own place, and of each other those that the own place has not sent.
+        self._copies: set[Place] = set()
+
+    def hear(self, channel: int, identifier: int) -> bool:
+        """Note a place; True while all frames come from one place that they may come from."""
+        self._places.add(self._place(channel, identifier))
+        return len(self._places) == 1 and self._is_allowed(*self._places)
+
+    def takes(self, time_ns: int, channel: int, identifier: int, data: bytes) -> bool:
+        """Whether the frame comes from the message's own place. time_ns: on a timeline without leaps."""
+        if self.last:
+            (last_ns, last_identifier, last_data, last_channel), origin_ns = self.last
+            self.last = None
+            self.takes(last_ns - origin_ns, last_channel, last_identifier, last_data)
+        place = self._place(channel, identifier)
+        if not self._is_allowed(place):
+            return False
+        is_named = self._has_address and place[1] == self._sender
+        own = self._own or place
+        is_silent = time_ns - self._own_ns > self._stale_ns
+        if is_named and own[1] != self._sender:
+            own, self.conflict = place, ""
+        elif is_silent and place in self._copies and not self.conflict:
+            own = place
+        if own != self._own:
+            self._own = own
+            self._recent.clear()
+        if place == own:
+            if len(self._recent) < 2:  # nothing to compare
+                self._recent.clear()
+            self._own_ns, self._turn = time_ns, self._turn + 1
+            self._recent[place].append(data)
+        elif self._is_compared and (is_named or not self._has_address or own[1] != self._sender):
+            self._compare(place, own, data, is_silent)
+        return place == own
+
+    def _compare(self, place: Place, own: Place, data: bytes, is_silent: bool) -> None:
+        """Compare a frame from elsewhere. What comes while the own place pauses has nothing to be compared with."""
+        unmatched, recent = self._recent[place], self._recent[own]
+        if is_silent or self._turns.get(place) != self._turn:
+            self._turns[place] = self._turn
+            is_late, is_early = data in recent, bool(unmatched) and unmatched[-1] == recent[-1]
+            if (is_late or is_early) and not is_silent:
+                self._copies.add(place)
+                unmatched.clear()
+            if is_silent or not is_late:
+                unmatched.append(data)
+            if len(unmatched) == RECENT and not self.conflict:
+                how = "one after the other" if is_silent else "with different data"
+                self.conflict = self._contradiction(own, place, how)
+
+    def _place(self, channel: int, identifier: int) -> Place:
+        return channel & ~TRANSMITTED, identifier & 0xFF if self._has_address else identifier
+
+    def _is_allowed(self, place: Place) -> bool:
+        """Whether the vehicle file allows `place`."""
+        return self._channel in (None, place[0]) and self._wanted in (None, place[1])
+
+    def _contradiction(self, own: Place, place: Place, how: str) -> str:
+        if own[0] != place[0]:
+            said, key = (
+                f"{hexadecimal(identifier_of(self.message))} comes on channels {own[0]} and {place[0]}",
+                f"channel = {own[0]}",
+            )
+        else:
+            said = f"parameter group {pgn(self.message.frame_id):#x} comes from senders {own[1]:#x} and {place[1]:#x}"
+            key = f"sender = {own[1]:#x}"
+        return f"{said} {how} ({self.message.name}): say which is meant, {key} under [bus.messages.{self.message.name}]"
 
 
 class Origins:
-    """Finds the message of a frame and takes each message from one place only.
+    """The `Origin` of each message of a database, found by the identifiers of frames.
 
-    The place is named by ``channel`` and ``sender`` in the vehicle file; else it is the sender in the DBC file, once
-    heard; else the first place heard. Identical frames from elsewhere are copies, as a gateway makes them; they take
-    over when the own place falls silent.
+    compared: the messages of which different data are a conflict.
     """
 
-    def __init__(self, mapping: BusMapping) -> None:
-        self._wanted = mapping.origins
-        self._exact: dict[int, Message] = {}
-        self._groups: dict[int, Message] = {}
-        self._places: dict[str, Place] = {}
-        self.recent: dict[str, deque[bytes]] = {}  # a message's own data, once it is heard elsewhere as well
-        self._sent: Counter[str] = Counter()  # frames of its own place, by message, once it is heard elsewhere
-        self._elsewhere: dict[tuple[str, Place], _Elsewhere] = {}
-        self.conflicts: dict[str, str] = {}  # the contradiction and its remedy, by message
+    def __init__(self, mapping: BusMapping, compared: Collection[str]) -> None:
+        self._origins: dict[int, Origin] = {}  # by identifier; below zero by parameter group
         for message in mapping.database.messages:
-            if mapping.j1939 and message.is_extended_frame:
-                self._groups[pgn(message.frame_id)] = message
-            else:
-                self._exact[message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)] = message
+            is_group = mapping.j1939 and message.is_extended_frame
+            key = ~pgn(message.frame_id) if is_group else identifier_of(message)
+            self._origins[key] = Origin(message, mapping, is_group, message.name in compared)
 
-    def message(self, identifier: int) -> Message | None:
-        """The message with this identifier or, in J1939, this parameter group."""
-        if found := self._exact.get(identifier):
-            return found
-        grouped = identifier & EFF_FLAG and not identifier & RTR_FLAG
-        return self._groups.get(pgn(identifier)) if grouped else None
+    def __iter__(self) -> Iterator[Origin]:
+        """In the order of the database."""
+        return iter(self._origins.values())
 
-    def claim(self, message: Message, channel: int, identifier: int) -> bool:
-        """Whether `message` is taken from this channel and identifier."""
-        place, now = self._place(message, channel, identifier), self._places.get(message.name)
-        if self._may_be(message, place) and (now is None or (self._is_in_dbc(message, place) and place[1] != now[1])):
-            self._places[message.name] = now = place
-        return place == now
+    def find(self, identifier: int) -> Origin | None:
+        """The origin of the message with this identifier or, in J1939, this parameter group."""
+        is_extended = identifier & EFF_FLAG and not identifier & RTR_FLAG
+        return self._origins.get(identifier) or (self._origins.get(~pgn(identifier)) if is_extended else None)
 
-    def own(self, name: str, data: bytes) -> None:
-        """Note a frame of the message of this name from its own place, to compare others with."""
-        self.recent[name].append(data)
-        self._sent[name] += 1
-
-    def take_over(self, message: Message, channel: int, identifier: int) -> bool:
-        """Take `message` from here if frames from here were copies of it; returns whether it is taken from here now."""
-        place = self._place(message, channel, identifier)
-        elsewhere = self._elsewhere.get((message.name, place))
-        if elsewhere and elsewhere.is_copy and message.name not in self.conflicts:
-            self._places[message.name] = place
-        return self._places.get(message.name) == place
-
-    def differs(self, message: Message, channel: int, identifier: int, data: bytes, silent: bool = False) -> bool:
-        """Whether frames from elsewhere contradict `message`; `data` is the last of them. silent: its own place is."""
-        place, own = self._place(message, channel, identifier), self._places.get(message.name)
-        if own is None or not self._may_be(message, place) or (self._is_in_dbc(message, own) and place[1] != own[1]):
-            return False  # it is known which is meant
-        recent = self.recent.setdefault(message.name, deque(maxlen=RECENT))
-        sent = self._sent[message.name]
-        known = self._elsewhere.setdefault((message.name, place), _Elsewhere(sent))
-        if silent:
-            known.differing += 1
-        elif data in recent:
-            known.differing = 0
-            known.is_copy |= sent > known.own_frames
-        elif known.unmatched is not None and sent > known.own_frames:
-            known.differing = 0 if known.unmatched in recent else known.differing + 1
-        known.own_frames, known.unmatched = sent, None if data in recent else data
-        if known.differing >= RECENT:
-            how = "one after the other" if silent else "with different data"
-            self.conflicts[message.name] = _conflict(message, own, place, how)
-        return message.name in self.conflicts
-
-    def _place(self, message: Message, channel: int, identifier: int) -> Place:
-        grouped = self._groups.get(pgn(identifier)) is message if identifier & EFF_FLAG else False
-        return channel, identifier & 0xFF if grouped else identifier
-
-    def _may_be(self, message: Message, place: Place) -> bool:
-        """Whether the vehicle file allows `place`."""
-        channel, sender = self._wanted.get(message.name, (None, None))
-        return channel in (None, place[0]) and sender in (None, place[1])
-
-    def _is_in_dbc(self, message: Message, place: Place) -> bool:
-        """Whether the DBC file names the sender of `place`, and the vehicle file none."""
-        return self._wanted.get(message.name, (None, None))[1] is None and place[1] == message.frame_id & 0xFF
-
-
-def _conflict(message: Message, own: Place, other: Place, how: str) -> str:
-    if own[0] != other[0]:
-        identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-        said, key = f"{hexadecimal(identifier)} comes on channels {own[0]} and {other[0]}", f"channel = {own[0]}"
-    else:
-        said = f"parameter group {pgn(message.frame_id):#x} comes from senders {own[1]:#x} and {other[1]:#x}"
-        key = f"sender = {own[1]:#x}"
-    return f"{said} {how} ({message.name}): say which is meant, {key} under [bus.messages.{message.name}]"
+    @property
+    def conflicts(self) -> dict[str, str]:
+        """The contradiction and its remedy, by message."""
+        return {origin.message.name: origin.conflict for origin in self if origin.conflict}

@@ -144,7 +144,7 @@ def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
         for channel, identifier in codec.heard(message.name):
             return InputError(f"{said}{message.name} came on channel {channel} as {hexadecimal(identifier)}: see [bus]")
     for identifier in codec.unknown:
-        if codec.origins.message(other := identifier ^ EFF_FLAG):
+        if codec.origins.find(other := identifier ^ EFF_FLAG):
             bits, others = (29, 11) if identifier & EFF_FLAG else (11, 29)
             return InputError(
                 f"{said}{hexadecimal(identifier)} has {bits} bits, the vehicle's {hexadecimal(other)} has {others}: "

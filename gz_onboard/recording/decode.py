@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,11 +19,10 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Accumulator, Codec, Handler
-from gz_onboard.bus.layout import PAUSE, MappedMessage, first_bit, is_not_available, raw_range
-from gz_onboard.bus.mapping import BusMapping, Protection, Source
-from gz_onboard.bus.requests import FUNCTIONAL
-from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, STALE_PERIODS, TRANSMITTED, Frame, MessageWindow, RoleWindow
+from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
+from gz_onboard.bus.layout import first_bit, is_not_available
+from gz_onboard.bus.mapping import Source
+from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, TICKS_PER_WINDOW, WINDOW_NS, Pipeline
 from gz_onboard.progress import Progress
 from gz_onboard.recording.frames import FrameColumns
@@ -111,7 +109,7 @@ class DecodedLog:
         self._events: list[tuple[dict[Any, int], Any, Rows, NDArray[np.int64] | None]] = []
         self._count(vars(codec), "received", np.arange(len(frames)))
         self._count(codec.faults, ("", TIME), np.flatnonzero(~self._kept))
-        self._good: dict[int, Rows] = {}  # by identifier
+        self._good: dict[str, Rows] = {}  # by message
         self._decoded: list[_Decoded] = []
         self._one_by_one: Rows = np.zeros(0, np.int64)
         self._decode(kept)
@@ -160,6 +158,7 @@ class DecodedLog:
             if len(self._one_by_one):
                 self._take(self._one_by_one[slice(*np.searchsorted(self._one_by_one, (begin, end)))])
                 windows = self.codec.windows()
+                self.codec.begin_at(self._origin_ns)
             if last:  # a window that has not ended
                 break
             for i, window in enumerate(waiting):
@@ -175,13 +174,10 @@ class DecodedLog:
         self.see_latest(len(now))
 
     def see_latest(self, end: int) -> None:
-        """Let the codec know the latest good frame of each identifier among those before row `end` of the log."""
-        frames = self.frames
-        for identifier, rows in self._good.items():
+        """Let the codec know the latest good frame of each message among those before row `end` of the log."""
+        for name, rows in self._good.items():
             if count := int(np.searchsorted(rows, end)):
-                row = rows[count - 1]
-                data = frames.data[row, : frames.length[row]].tobytes()
-                self.codec.latest[identifier] = int(frames.time_ns[row]), data
+                (self.codec.latest[name],) = self.frames[rows[count - 1 : count]].tuples()
 
     def tuples(self, rows: slice) -> list[Frame]:
         """The frames of a part of the log but those of wrong times."""
@@ -215,41 +211,40 @@ class DecodedLog:
         """Decode the frames in these rows, as far as it can be done by columns."""
         codec, mapping = self.codec, self.codec.mapping
         places = _by_place(self.frames, rows)
-        messages = [None if identifier & _NO_DATA else codec.origins.message(identifier) for _, identifier, _ in places]
-        heard = Counter(message.name for message in messages if message)
-        asked = {*FUNCTIONAL, *(r.request for r in mapping.requests), *(r.response for r in mapping.requests)}
-        asked = asked if mapping.requests else set()
-        groups = {group.message: i for i, group in enumerate(codec.groups)}
+        origins = [None if identifier & _NO_DATA else codec.origins.find(identifier) for _, identifier, _ in places]
+        heard = Counter(origin.message.name for origin in origins if origin)
+        asked = {*codec.asked, *(request.response for request in mapping.requests)}
         one_by_one = []
-        for (channel, identifier, those), message in zip(places, messages, strict=True):
-            several = message is not None and heard[message.name] > 1
+        for (channel, identifier, those), origin in zip(places, origins, strict=True):
+            several = origin is not None and heard[origin.message.name] > 1
             if len(places) > _MOST_PLACES or identifier in asked or several:
                 one_by_one.append(those)
                 continue
-            handler = _handler(codec, channel, identifier)
+            codec.inbox(channel, identifier)
+            decoder = codec.decoders[origin.message.name] if origin else None
             if identifier & ERR_FLAG:
                 self._count(vars(codec), "error_frames", those)
-            elif message is None:
+            elif decoder is None:
                 self._count(codec.unknown, identifier, those)
-            elif handler is codec._decoders[message.name] and (layout := _layout(message, mapping)):
-                self._decode_message(layout, groups.get(message.name), identifier, those)
+            elif decoder.is_sole and _has_columns(decoder):
+                self._decode_message(decoder, those)
             else:
                 one_by_one.append(those)
         if one_by_one:
             self._one_by_one = np.sort(np.concatenate(one_by_one))
 
-    def _decode_message(self, mapped: MappedMessage, group: int | None, identifier: int, rows: Rows) -> None:
-        """Decode all frames of one message; group: that of the codec, None for a message without roles."""
+    def _decode_message(self, mapped: MessageDecoder, rows: Rows) -> None:
+        """Decode all frames of one message."""
         message, n, protection, faults = mapped.message, mapped.message.length, mapped.protection, self.codec.faults
         right = self.frames.length[rows] == n
         self._count(faults, (message.name, LENGTH), rows[~right])
         rows = rows[right]
         data = self.frames.data[rows, :n]
-        if group is not None and protection.crc and len(rows):
+        if protection.crc and len(rows):
             right = _has_right_crc(data)
             self._count(faults, (message.name, CRC), rows[~right])
             rows, data = rows[right], data[right]
-        if group is not None and protection.counter:
+        if protection.counter:
             wrong, missing = _follow_counter(mapped, data, self._passed_ns[rows])
             self._count(faults, (message.name, COUNTER), rows[wrong])
             jumps = np.flatnonzero(missing)
@@ -257,8 +252,8 @@ class DecodedLog:
             rows, data = rows[~wrong], data[~wrong]
         if not len(rows):
             return
-        self._good[identifier] = rows
-        if group is None:
+        self._good[message.name] = rows
+        if mapped.group is None:
             return
         columns: list[_Column] = []
         seen: Mask = np.zeros(len(rows), bool)  # with a signal of ours, on a page of a multiplexer
@@ -278,44 +273,23 @@ class DecodedLog:
         if not seen.all():
             rows, columns = rows[seen], [_Column(c.source, c.raw[seen], c.real[seen]) for c in columns]
         if len(rows):
-            self._decoded.append(_Decoded(group, rows, self._passed_ns[rows], columns))
+            self._decoded.append(_Decoded(mapped.group, rows, self._passed_ns[rows], columns))
 
     def _take(self, rows: Rows) -> None:
-        """Let the codec decode the frames in these rows, at their times on the timeline."""
+        """Let the codec take the frames in these rows, at their times on the timeline."""
         for row, frame in zip(rows.tolist(), self.frames[rows].tuples() if len(rows) else (), strict=True):
-            self._take_one(row, frame)
-
-    def _take_one(self, row: int, frame: Frame) -> bool:
-        """Let the codec decode one frame; whether it was good."""
-        (time_ns, identifier, data, channel), codec = frame, self.codec
-        passed = int(self._passed_ns[row])
-        codec._origin_ns = time_ns - passed  # as it was then: a clock that was set moves it
-        dropped = _handler(codec, channel & ~TRANSMITTED, identifier)(passed, data)
-        codec._origin_ns = self._origin_ns
-        if not dropped:
-            codec.latest[identifier] = (time_ns, data)
-        return not dropped
+            self.codec.take_at(frame, int(self._passed_ns[row]))
 
     def _samples_one_by_one(self) -> dict[str, Column]:
         """The samples of the frames that the codec decodes itself."""
         codec, samples = self.codec, dict[str, list[tuple[float, float]]]()
-        by_name = {accumulator.mapped.message.name: accumulator for accumulator in codec._accumulators}
-
-        @cache
-        def accumulators(identifier: int) -> list[Accumulator]:
-            """The accumulators that frames with this identifier can add to."""
-            message = codec.origins.message(identifier)
-            names = [r.name for r in codec.mapping.requests if r.response == identifier]
-            names += [message.name] if message else []
-            return [by_name[name] for name in names if name in by_name]
-
-        rows = self._one_by_one
-        for row, frame in zip(rows.tolist(), self.frames[rows].tuples(), strict=True):
-            for accumulator in accumulators(frame[1]) if self._take_one(row, frame) else ():
-                if window := accumulator.window():
-                    for source, sample in zip(accumulator.mapped.sources, window.roles, strict=True):
-                        if sample:
-                            samples.setdefault(source.role, []).append((sample.time, sample.value))
+        for i in range(len(self._one_by_one)):
+            self._take(self._one_by_one[i : i + 1])
+            for window in codec.windows():
+                for role, sample in zip(codec.groups[window.group].roles, window.roles, strict=True):
+                    if sample:
+                        samples.setdefault(role, []).append((sample.time, sample.value))
+        codec.begin_at(self._origin_ns)
         columns = {role: np.array(pairs) for role, pairs in samples.items()}
         return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
@@ -414,21 +388,12 @@ def _by_place(frames: FrameColumns, rows: Rows) -> list[tuple[int, int, Rows]]:
     return sorted(found, key=lambda place: int(place[2][0]))
 
 
-def _handler(codec: Codec, channel: int, identifier: int) -> Handler:
-    """The codec's handler for frames from a place; the first call for a place lets the codec choose the origin."""
-    return codec._handlers.setdefault(channel, {}).get(identifier) or codec._first_heard(channel, identifier)
-
-
-def _layout(message: Message, mapping: BusMapping) -> MappedMessage | None:
-    """The layout of a message; None for one that columns cannot follow: a wide counter, or pages within pages."""
-    sources = [source for source in mapping.sources if source.message == message.name]
-    protection = mapping.protection.get(message.name, Protection())
-    period = mapping.periods.get(message.name)
-    mapped = MappedMessage(message, sources, protection, period, mapping.not_available)
-    pagers = [_pager(message, signal) for signal in mapped.signals]
+def _has_columns(decoder: MessageDecoder) -> bool:
+    """Whether columns can follow a message: not one with a wide counter, or with pages within pages."""
+    message, counter = decoder.message, decoder.protection.counter
+    pagers = [_pager(message, signal) for signal in decoder.signals]
     nested = any(pager is not None and pager.multiplexer_ids is not None for pager in pagers)
-    wide = protection.counter and message.get_signal_by_name(protection.counter).length > _WIDEST_COUNTER
-    return None if nested or wide else mapped
+    return not nested and not (counter and message.get_signal_by_name(counter).length > _WIDEST_COUNTER)
 
 
 def _pager(message: Message, signal: Signal) -> Signal | None:
@@ -443,26 +408,25 @@ def _has_right_crc(data: NDArray[np.uint8]) -> Mask:
     constant, tables = sae_j1850_tables(data.shape[1] - 1)
     crc = np.full(len(data), constant, np.uint8)
     for column, table in zip(data.T, tables, strict=False):
-        crc ^= np.array(table, np.uint8)[column]
+        crc ^= np.frombuffer(table, np.uint8)[column]
     right: Mask = crc == data[:, -1]
     return right
 
 
 def _follow_counter(
-    mapped: MappedMessage, data: NDArray[np.uint8], passed_ns: NDArray[np.int64]
+    mapped: MessageDecoder, data: NDArray[np.uint8], passed_ns: NDArray[np.int64]
 ) -> tuple[Mask, NDArray[np.int64]]:
     """(mask of frames whose counter is wrong, frames that it shows as missing before each); rules of the live codec."""
     assert mapped.protection.counter
     counter = mapped.message.get_signal_by_name(mapped.protection.counter)
-    low, high = map(int, raw_range(counter, mapped.not_available))
-    pause_ns = round((STALE_PERIODS * mapped.period if mapped.period else PAUSE) * 1e9)
+    low, high = mapped.counts
     counts = _raw(counter, data)
     wrong = (counts < low) | (counts > high)
     rows = np.flatnonzero(~wrong)
     counts, modulo = counts[rows], high - low + 1
     expected = np.concatenate(([low], np.where(counts < high, counts + 1, low)[:-1]))[: len(rows)]
     since_ns = np.diff(passed_ns[rows], prepend=_NEVER_NS)
-    missing = np.where(since_ns < pause_ns, (counts - expected) % modulo, 0)
+    missing = np.where(since_ns < mapped.pause_ns, (counts - expected) % modulo, 0)
     far = (missing > 0) & (missing >= modulo // 2)
     wrong[rows[far]] = True
     lost = np.zeros(len(data), np.int64)

@@ -213,7 +213,7 @@ def _seal(words: Words) -> Words:
     constant, tables = sae_j1850_tables(7)
     crc = np.full(len(words), constant, dtype=np.uint64)
     for i, table in enumerate(tables):
-        crc ^= np.array(table, dtype=np.uint64)[(words >> np.uint64(8 * i)) & np.uint64(0xFF)]
+        crc ^= np.frombuffer(table, np.uint8).astype(np.uint64)[(words >> np.uint64(8 * i)) & np.uint64(0xFF)]
     return (words & np.uint64(2**56 - 1)) | crc << np.uint64(56)
 
 

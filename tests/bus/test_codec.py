@@ -21,12 +21,10 @@ from gz_onboard.bus.codec import (
     NOT_AVAILABLE,
     RANGE,
     TIME,
-    UNDECODABLE,
     Codec,
     known_identifiers,
 )
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.units import to_si
@@ -305,7 +303,7 @@ def test_a_babbling_node_does_not_fill_the_memory():
     assert events_of(codec, [temperatures(EPOCH + MS)])
     assert len(codec.unknown) < 5000
     assert sum(codec.unknown.values()) + codec.unknown_others == count
-    assert sum(map(len, codec._handlers.values())) < 5000
+    assert sum(map(len, codec._inboxes.values())) < 5000
     assert len(codec.latest) == 1
 
 
@@ -314,14 +312,12 @@ def test_latest_and_values_hold_only_what_is_good():
     good = pack(0, EPOCH, BMS_PackVoltage=50.0, BMS_PackCurrent=-327.68, BMS_StateOfCharge=120.0)
     bad = (EPOCH + 100 * MS, 0x200, bytes(8), 0)
     events_of(codec, [good, bad])
-    assert codec.latest == {0x200: (EPOCH, good[2])}
-    values = codec.values(0x200, good[2])
+    assert codec.latest == {"BMS_Pack": good}
+    values = codec.values("BMS_Pack", good[2])
     assert values["BMS_PackVoltage"] == pytest.approx(50.0)
     assert values["BMS_PackCurrent"] is None
     assert values["BMS_StateOfCharge"] is None
-    assert codec.message_name(0x200) == "BMS_Pack"
-    assert codec.values(0x200, b"") == {}
-    assert codec.values(0x7FF, bytes(8)) == {}
+    assert codec.values("BMS_Pack", b"") == {}
 
 
 # --- time -----------------------------------------------------------------------------------------------------
@@ -441,8 +437,8 @@ def test_j1939_goes_by_the_parameter_group(tmp_path):
     for identifier in (0x0CF00431, 0x0CF00400, 0x18F00400):  # another sender until its own is heard; another priority
         (event,) = events_of(codec, [(0, identifier | EFF_FLAG, speed, 0)])
         assert value_of(codec, event, "motor_speed") == pytest.approx(1000 * 2 * math.pi / 60)
-        assert codec.message_name(identifier | EFF_FLAG) == "EEC1"
-        assert codec.values(identifier | EFF_FLAG, speed) == {"EngineSpeed": 1000.0}
+        assert codec.latest["EEC1"] == (0, identifier | EFF_FLAG, speed, 0)
+    assert codec.values("EEC1", speed) == {"EngineSpeed": 1000.0}
     assert events_of(codec, [(0, 0x0CF00431 | EFF_FLAG, speed, 0)]) == []
     assert codec.copies == 1
     for identifier in (0x18EA0021, 0x18EAFF21):  # PDU1: the destination is no part of the group
@@ -506,6 +502,9 @@ def test_copies_take_over_where_the_first_place_falls_silent(tmp_path):
     assert not codec.origins.conflicts and not codec.faults
     assert len(events) >= 20 + 100 - 22  # two seconds until the silence is one
     assert events[-1][2][0] == pytest.approx(379.9)
+    back = on_two_buses([(3800 + i, 3800 + i) for i in range(150)])[240:]
+    assert len(events_of(codec, back)) == len(back) // 2  # the first place is a copy now
+    assert not codec.origins.conflicts and not codec.faults
 
 
 @pytest.mark.parametrize("volts", [[3600, 3601] * 60, [120 + i for i in range(120)]])
@@ -558,7 +557,7 @@ def test_j1939_senders_without_end_do_not_fill_the_memory(tmp_path):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
     count = 20_000
     events = events_of(codec, [(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
-    assert sum(map(len, codec._handlers.values())) < 5000 and len(codec.latest) < 5000
+    assert sum(map(len, codec._inboxes.values())) < 5000 and len(codec.latest) < 5000
     assert len(events) + codec.copies == count
     assert not codec.unknown and not codec.unknown_others
 
@@ -607,7 +606,7 @@ def test_floats(tmp_path):
         data = struct.pack("<ff", single, bare)
         (event,) = events_of(codec, [(0, 256, data, 0)])
         assert event[2] == want
-        assert all(v is None or math.isfinite(v) for v in codec.values(256, data).values())
+        assert all(v is None or math.isfinite(v) for v in codec.values("Floats", data).values())
     assert codec.faults == {
         ("Floats.Single", NOT_AVAILABLE): 1,
         ("Floats.Single", RANGE): 2,
@@ -746,8 +745,9 @@ def test_whatever_the_bus_brings(frames):
                     low, high = by_role[role]
                     assert low <= value <= high, (role, value)
             assert not absent or any(r in (NOT_AVAILABLE, RANGE) for _, r in codec.faults)
-        assert all(v is None or math.isfinite(v) for v in codec.values(frame[1], frame[2]).values())
-    assert {reason for _, reason in codec.faults} <= {LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE}
+        if origin := codec.origins.find(frame[1]):
+            assert all(v is None or math.isfinite(v) for v in codec.values(origin.message.name, frame[2]).values())
+    assert {reason for _, reason in codec.faults} <= {LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME}
 
 
 @settings(max_examples=150, deadline=None)
@@ -796,16 +796,6 @@ def test_whatever_comes_to_cantools(odd_mapping, frames):
         assert len(events) + accounted(codec) - before == 1 or quiet
         for _, _, values in events:
             assert all(v is None or math.isfinite(v) for v in values)
-
-
-def test_raw_values_are_those_of_whole_frames():
-    message = reference().database.get_message_by_name("IMU_Acceleration")
-    assert identifier_of(message) == message.frame_id
-    raw = raw_values(message, b"\xff" * message.length)
-    assert raw is not None
-    for signal in message.signals:  # all ones are -1 of a signed signal
-        assert is_not_available(signal, raw[signal.name]) == (signal.length >= 8 and not signal.is_signed)
-    assert raw_values(message, b"\xff" * (message.length - 1)) is None
 
 
 def test_no_time_of_the_timeline_is_before_1970_by_a_clock_that_was_set_back():

@@ -199,9 +199,11 @@ class Watch:
         latest = second.latest
         for frame in run.logged:
             if not frame[3] & TRANSMITTED:
-                before = latest.get(frame[1])
+                origin = second.origins.find(frame[1])
+                name = origin.message.name if origin else ""
+                before = latest.get(name)
                 events_of(second, (frame,))
-                self.used += latest.get(frame[1]) is not before
+                self.used += latest.get(name) is not before
         counted = sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING)
         counted += sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames + codec.copies
         assert codec.received == self.used + counted, f"{codec.received} frames, {self.used} used, {counted} counted"
@@ -210,7 +212,7 @@ class Watch:
         assert run.pipeline.counts().dropped == sum(n for (_, r), n in codec.faults.items() if r in DROPPING)
         messages = len(codec.mapping.database.messages)
         assert len(codec.unknown) <= KEPT
-        assert sum(map(len, codec._handlers.values())) <= KEPT + messages
+        assert sum(map(len, codec._inboxes.values())) <= KEPT + messages
         assert len(codec.latest) <= messages
         self._time = times[-1]
         self.told["estimates"] += len(run.estimates)
@@ -284,7 +286,7 @@ def run(count: int, seed: int) -> Report:
         used += watch.used
         unknown += sum(codec.unknown.values()) + codec.unknown_others
         errors += codec.error_frames
-        most = max(most, len(codec._handlers))
+        most = max(most, sum(map(len, codec._inboxes.values())))
         told += watch.told
         states += watch.states
         for (_, reason), n in codec.faults.items():

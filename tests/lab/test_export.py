@@ -169,7 +169,7 @@ def test_what_is_beyond_the_range_of_the_dbc_is_null_as_on_board(tmp_path: Path)
     )
     decoder = Decoder(codec.mapping)
     ((_, name, values),) = decoder.decode([[(START, message.frame_id, raw, 0)]])
-    on_board = codec.values(message.frame_id, raw)
+    on_board = codec.values(message.name, raw)
     assert name == "BMS_Pack"
     assert on_board["BMS_StateOfCharge"] is None
     assert values == {column_name(s): on_board[s.name] for s in message.signals}

@@ -237,7 +237,7 @@ def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
     codec = Codec(reference().mapping)
 
     def decoded(name):
-        return [codec.values(sent[name].identifier, int(word).to_bytes(8, "little")) for word in sent[name].words]
+        return [codec.values(name, int(word).to_bytes(8, "little")) for word in sent[name].words]
 
     assert decoded("DYNO_Roller")[-1]["DYNO_RollerSpeed"] == pytest.approx(scooter.speed, abs=0.05)
     assert abs(np.mean([values["IMU_AccelX"] for values in decoded("IMU_Acceleration")])) < 0.01

@@ -72,6 +72,12 @@ def tlmoto_frames(time_ns: int, rpm: float, volts: float, amps: float) -> list[F
     return [(time_ns + i * MS, identifier, payload, 0) for i, (identifier, payload) in enumerate(data)]
 
 
+def name_of(codec: Codec, identifier: int) -> str:
+    origin = codec.origins.find(identifier)
+    assert origin
+    return origin.message.name
+
+
 def test_tlmoto_frames_of_its_layout():
     codec = Codec(vehicle("tlmoto").mapping)
     found = values(codec, events_of(codec, tlmoto_frames(1_049 * MS, 1200, 115.625, 41.25)))
@@ -92,7 +98,7 @@ def test_tlmoto_cells_are_in_its_dbc():
     codec = Codec(vehicle("tlmoto").mapping)
     data = bytes([0, 0xCA, 0xD1, 0xD1, 0xD0, 0xD1, 0, 0])
     assert events_of(codec, [(0, 51, data, 0)]) == []  # cell voltages play no role yet, but stand in the log
-    cells = list(codec.values(51, data).values())
+    cells = list(codec.values(name_of(codec, 51), data).values())
     assert cells[0] is None  # not read by the BMS: 2.00 V is no voltage of a cell in use
     assert cells[1:] == pytest.approx([4.02, 4.09, 4.09, 4.08, 4.09])
 
@@ -171,7 +177,7 @@ def test_tlmoto_real_cell_voltages_against_what_others_decoded(session):
     folder = real("tlmoto_motostudent_kiro")
     codec = Codec(vehicle("tlmoto").mapping)
     cells = {
-        (identifier - 50, round(time_ns / MS)): list(codec.values(identifier, data).values())
+        (identifier - 50, round(time_ns / MS)): list(codec.values(name_of(codec, identifier), data).values())
         for batch in read_frames(folder / f"{session}.candump.log")
         for time_ns, identifier, data, _ in batch
         if 51 <= identifier <= 55
