@@ -249,14 +249,9 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
     estimator = EventEstimator(groups, battery, model, vehicle.riding, setting.make)
     estimator._outlook._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
-    cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.forecaster.load
-    prior_ride = load.prior_ride
-
-    def of_one_cell(ambient: float, altitude: float) -> tuple[float, float]:
-        power, speed = prior_ride(ambient, altitude)
-        return power / cells, speed
-
-    load.prior_ride = of_one_cell  # type: ignore[method-assign]
+    cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator._load
+    power_of_prior = load.power_of_prior
+    load.power_of_prior = lambda now: power_of_prior(now) / cells  # type: ignore[method-assign]
     return estimator
 
 

@@ -23,9 +23,8 @@ from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
 from gz_onboard.estimator.motion import MOTION
-from gz_onboard.estimator.pattern import MOST_BINS, STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
@@ -44,6 +43,7 @@ class ConsumptionConfig:
     recent_m: float = 1000.0  # the same of what a rider calls recent consumption
     prior_m: float = 3000.0  # riding that the prior riding counts for in the sums
     history_segments: int = 40  # 10 km that a fault found later can be unlearned of
+    steepest: float = 0.3  # sine: no road is steeper
     acceleration_limit: float = 15.0  # m/s²: no road gives more; a second that shows more is left out
     ride_ends_s: float = 600.0  # standstill after which another ride begins
     tyres_cool_s: float = 3600.0  # standstill after which tyres are cold
@@ -239,6 +239,10 @@ class Segment:
     level: float = 0.0  # J, modelled, less what height and speed have stored
     unseen: float = 0.0  # m of which no sensor showed the grade
     climb: float = 0.0  # m, of the rest
+    prior: float = 0.0  # J, that the prior riding takes for the same way in the same air
+    speed_squares: float = 0.0  # m³/s²: squared speed over the distance, for the explanation, as are
+    grade_squares: float = 0.0  # m: squared grade
+    lateral_squares: float = 0.0  # m³/s⁴: squared lateral acceleration
 
     @property
     def energy(self) -> float:
@@ -293,7 +297,7 @@ class Terrain:
         way, climb, unseen = self.way + way, self.climb + climb, self.unseen + unseen
         if way < stretch:
             return Terrain(self.squares, self.stretches, way, climb, unseen)
-        if unseen > way / 5 or abs(climb) > STEEPEST * way:
+        if unseen > way / 5 or abs(climb) > CONSUMPTION.steepest * way:
             return Terrain(self.squares, self.stretches)
         keep = 1 - 1 / CONSUMPTION.terrain_memory
         return Terrain(keep * self.squares + climb * climb * stretch / way, keep * self.stretches + 1)
@@ -315,12 +319,16 @@ class AuxiliaryPower:
         self.now = self.mean = 0.0  # W beyond that
         self._seen = 0.0  # s that the mean is of
 
-    def step(self, dt: float, measured: float | None) -> None:
-        """Take in `dt` [s] of the power of all auxiliaries [W]; None: not measured."""
-        if measured is None:
+    def step(self, dt: float, total: float | None, loads: float | None = None) -> None:
+        """Take in `dt` [s] of the power of all auxiliaries [W]; without it, that of heater and air conditioner alone.
+
+        None: not measured.
+        """
+        beyond = loads if total is None else total - self._modelled
+        if beyond is None:
             self.now = self.mean
             return
-        self.now = measured - self._modelled
+        self.now = beyond
         self._seen = min(self._seen + dt, CONSUMPTION.auxiliary_mean_s)
         if self._seen > 0:
             self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
@@ -379,7 +387,7 @@ class ConsumptionLearner:
         self.prior_price = moving + stops  # J/m: with the prior's speed, the unit of saved habits
         self.prior = Habits.before(prior, stops / moving)
         self.state = RidingState(self.prior)
-        self.pattern, self.auxiliaries = Pattern(), AuxiliaryPower(model)
+        self.auxiliaries = AuxiliaryPower(model)
         self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
         self.distance = 0.0  # m ridden, without towed metres
         self.rides = 0  # that have ended
@@ -472,14 +480,13 @@ class ConsumptionLearner:
         grade: float | None,
         power: float,
         conditions: Conditions,
-        inputs: EffectInputs | None = None,
         period: float = 0.0,
         motor_power: float | None = None,
     ) -> bool:
         """Take in `dt` [s] of riding at `speed` [m/s], `grade` (sine) and `power` [W] of the pack.
 
-        inputs: of an `extended` load model; period: of the speed's messages [s], as between two of them there is no
-        acceleration; motor_power: into the motor [W], None for all. Returns whether a segment was learned.
+        period: of the speed's messages [s], as between two of them there is no acceleration; motor_power: into the
+        motor [W], None for all. Returns whether a segment was learned.
         """
         self._gather(dt, speed, grade, power, power if motor_power is None else motor_power)
         second, segment, c = self._second, self._segment, CONSUMPTION
@@ -490,10 +497,13 @@ class ConsumptionLearner:
         if abs(acceleration) > c.acceleration_limit:  # a sensor errs, or the wheel spins
             self.pause()
             return False
-        modelled, repeated = self._modelled(mean, acceleration, conditions, inputs)
+        grade_seen, moving = 0.0, abs(mean) > MOVING
+        if moving:
+            grade_seen = max(min(second.climb / abs(second.distance), c.steepest), -c.steepest)
+        q = self.load.quantities(mean, acceleration, conditions, grade_seen, self.time_moving)
+        modelled, repeated = (second.seconds * power for power in self.load.power_ridden(q, second.seconds))
         stored = self._weight * second.climb + self._moving_mass * (speed * speed - start * start) / 2
         auxiliary = self.auxiliaries.now * second.seconds
-        moving = abs(mean) > MOVING
         if moving and grade is not None:
             self._watch_towing(modelled - (repeated - stored + second.energy - auxiliary) / 2)
             if self.towed:
@@ -516,9 +526,11 @@ class ConsumptionLearner:
         segment.level -= stored
         segment.climb += second.climb
         segment.unseen += second.unseen
-        segment.distance += abs(second.distance)
-        motion = mean, acceleration, inputs.lateral_acceleration if inputs else None
-        self.pattern.add(second.seconds, motion, second.distance, second.climb)
+        way = abs(second.distance)
+        segment.distance += way
+        segment.speed_squares += mean * mean * way
+        segment.grade_squares += grade_seen * grade_seen * way
+        segment.lateral_squares += q.get("lateral_acceleration", 0.0) ** 2 * way
         self._second = Second(start_speed=speed)
         if segment.distance < c.segment_m:
             return False
@@ -541,19 +553,6 @@ class ConsumptionLearner:
         self.time_moving += dt if speed > MOVING else 0.0
         self.distance += 0.0 if self.towed else way
 
-    def _modelled(
-        self, speed: float, acceleration: float, conditions: Conditions, inputs: EffectInputs | None
-    ) -> tuple[float, float]:
-        """(energy of the second by the model, energy of riding it again) [J]."""
-        second = self._second
-        q = self.load.quantities(speed, acceleration, conditions)
-        if abs(speed) > MOVING:
-            q["grade"] = max(min(second.climb / abs(second.distance), STEEPEST), -STEEPEST)
-        if inputs:
-            self.load.extend(q, inputs, conditions.ambient, self.time_moving)
-        then, again = self.load.power_ridden(q, inputs, second.seconds)
-        return then * second.seconds, again * second.seconds
-
     def _watch_towing(self, unexplained: float) -> None:
         """Unlearn the metres that something else has paid for: road and bus leave too much energy unexplained.
 
@@ -573,7 +572,8 @@ class ConsumptionLearner:
         """Learn from the segment that has ended."""
         c, segment, state, speed = CONSUMPTION, self._segment, self.state, self.load.prior.speed
         way, habits = segment.distance, state.habits
-        unit = self.load.prior_prices(conditions.ambient, conditions.altitude)[0] * way
+        moving, stops = self.load.prior_prices(conditions.ambient, conditions.altitude)
+        unit, segment.prior = moving * way, (moving + stops) * way
         unseen, factor = segment.unseen / way, habits.factor.now
         paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
         # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
@@ -593,7 +593,6 @@ class ConsumptionLearner:
             state.recent.faded(segment, c.recent_m),
             state.terrain.ridden(way, segment.climb, segment.unseen),
         )
-        self.pattern.fade(exp(-way / c.memory_m))
         self._segment = Segment()
 
     def _revert(self, distance: float) -> None:
@@ -625,7 +624,7 @@ class ConsumptionLearner:
             habits = replace(before, price=before.price.of_another_rider(), pace=before.pace.of_another_rider())
             if len(self.other_riders) > CONSUMPTION.most_riders:
                 del self.other_riders[next(iter(self.other_riders))]
-        self.rider, self._segment, self.pattern = rider, Segment(), Pattern()
+        self.rider, self._segment = rider, Segment()
         self._history.clear()
         self.state = RidingState(replace(habits, factor=before.factor), terrain=self.state.terrain)
 
@@ -651,7 +650,6 @@ class ConsumptionLearner:
             "state": asdict(self.state),
             "rider": self.rider,
             "riders": {name: asdict(habits) for name, habits in self.other_riders.items()},
-            "pattern": self.pattern.snapshot(),
             "auxiliary_power": self.auxiliaries.snapshot(),
             "effects": dict(self.load.states),
             "still": self.still,
@@ -669,7 +667,6 @@ class ConsumptionLearner:
         self.state = RidingState(_habits(state["habits"], scales), sums, recent, terrain)
         self.rider = saved["rider"]
         self.other_riders = {name: _habits(habits, scales) for name, habits in saved["riders"].items()}
-        self.pattern = restored_pattern(saved["pattern"])
         self.auxiliaries.restore(saved["auxiliary_power"])
         self.load.states = dict(saved["effects"])
         self.still, self.time_moving = saved["still"], saved["time_moving"]
@@ -694,7 +691,10 @@ def _numbers(of: type, number: Number = FINITE) -> dict[str, Number]:
 
 _HABITS = {quantity.name: _numbers(Quantity) for quantity in fields(Habits)}
 _POSITIVE = Number(0.0, 1e12)
-_SUMS = _numbers(Segment, Number(-1e12, 1e12)) | dict.fromkeys(("distance", "duration", "squares", "unseen"), _POSITIVE)
+_SUMS = _numbers(Segment, Number(-1e12, 1e12)) | dict.fromkeys(
+    ("distance", "duration", "squares", "unseen", "prior", "speed_squares", "grade_squares", "lateral_squares"),
+    _POSITIVE,
+)
 FIELDS = {
     "unit": dict.fromkeys(("price", "speed"), Number(1e-6, 1e6)),
     "state": {
@@ -705,7 +705,6 @@ FIELDS = {
     },
     "rider": Text(CONSUMPTION.most_name_letters),
     "riders": Each(_HABITS, CONSUMPTION.most_riders),
-    "pattern": Each(Each(FINITE, 10), MOST_BINS),
     "auxiliary_power": Number(-1e5, 1e5),  # W
     "effects": Each(FINITE, 100),
     "still": Number(0.0, 1e10),  # s

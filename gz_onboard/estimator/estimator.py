@@ -15,7 +15,7 @@ from typing import Any
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.model_inputs import ModelInputs
+from gz_onboard.estimator.load_model import PresentLoad
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
 from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.plausibility import Plausibility
@@ -29,7 +29,7 @@ from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState
 from gz_onboard.estimator.start import read_saved
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.weakest import WeakestGroup
-from gz_onboard.events import NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
+from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model
@@ -77,7 +77,7 @@ class Estimator:
         self.signals = Signals(groups, battery.window.of_cells)
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.explainer = RangeExplainer(self.forecaster, self.signals)
+        self.explainer = RangeExplainer(self.forecaster)
         self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
@@ -94,7 +94,9 @@ class Estimator:
         self._temperatures = Temperatures(self.signals, p)
         self.soc = StateOfCharge(battery, model, make, self.signals, self.plausibility.pack.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
-        self._inputs = ModelInputs(self.forecaster, self.motion, self._temperatures, self.soc, self._vibration)
+        self._load = PresentLoad(
+            self.forecaster.learner, self.motion, self._temperatures, self.soc, self._vibration, self.signals
+        )
 
     @property
     def filter(self) -> SocFilter | None:
@@ -103,7 +105,7 @@ class Estimator:
 
     def vibration(self, now: float) -> float:
         """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
-        return self._inputs.vibration(now)
+        return self._load.vibration(now)
 
     def ridden_by(self, rider: str) -> None:
         """`rider` rides from now on."""
@@ -135,7 +137,7 @@ class Estimator:
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self.signals.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
-        self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._inputs)
+        self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._load)
         self.weakest.step(now, self._reading, temperature, self.soc)
         self._follow_activity(now, dt)
         self._ride(now, dt)
@@ -172,7 +174,7 @@ class Estimator:
 
         def road_power() -> float | None:
             known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
-            return self._inputs.power(now) if known else None
+            return self._load.power(now) if known else None
 
         def error(voltage: float, current: float, sensor: str) -> float | None:
             return self.soc.cell_error(now, (voltage, current), sensor, cells)
@@ -185,7 +187,7 @@ class Estimator:
         rides = speed is not None and abs(speed) > MOVING and dt < self.signals.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.soc.rest_voltage
-            return reading._replace(current=self._inputs.power(now) / voltage, source=CurrentSource.MODEL)
+            return reading._replace(current=self._load.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _compare_grades(self, now: float, dt: float) -> None:
@@ -195,7 +197,7 @@ class Estimator:
         towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
         before = grades.faulty
-        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._inputs.power_at(now, v, a))
+        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._load.power_at(now, v, a))
         if grades.faulty != before:
             self.motion.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
         left_out, self._distrusted = self._distrusted, self.plausibility.distrusted
@@ -228,7 +230,8 @@ class Estimator:
         self._activity.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
         measured = None if auxiliary is None or voltage is None else voltage * auxiliary
-        self.forecaster.learner.auxiliaries.step(min(dt, self.signals.pause), measured)
+        loads = [power for role in LOADS if (power := signals[role].get(now)) is not None]
+        self.forecaster.learner.auxiliaries.step(min(dt, self.signals.pause), measured, sum(loads) if loads else None)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
@@ -246,8 +249,7 @@ class Estimator:
             speed,
             self.motion.grade,
             power,
-            self._inputs.conditions(now, self.signals.motor_temperature.get(now)),
-            self._inputs.effect_inputs(now),
+            self._load.conditions(now),
             next((self.signals[role].period for role in self.signals.mapped(SPEEDS)), 0.0),
             self._drive(now, reading.voltage, power),
         )
@@ -266,7 +268,7 @@ class Estimator:
         cells = temperature, self._temperatures.cells_sd(now)
         missing = self._reasons(now) | int(self.signals.lacking)
         lost = sum([variance for reason, variance in _LOSS_VARIANCES if reason & missing])
-        conditions = self._inputs.conditions(now)
+        conditions = self._load.conditions(now)
         soc = self.soc.ageing.state_of_charge(filter_)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activity.now))
         if self._outlook.forecast:

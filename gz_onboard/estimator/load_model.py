@@ -1,6 +1,6 @@
-"""Forward model of the load on board: its inputs, as far as they are known, and typical values for the others.
+"""Forward model of the load on board: from speed, acceleration, grade and conditions to power at the pack.
 
-Effects of an extended model read more than speed, acceleration and grade. For the riding so far they get heading,
+Effects of a vehicle file may read more than speed, acceleration and grade. For the riding so far they get heading,
 lateral acceleration, vibration and time moving as measured. For the riding to come
 
 - the heading is unknown: the mean over all headings, so that a steady wind costs what it costs on a round trip;
@@ -15,13 +15,20 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import pi
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.model import Model, air_density, stepping
+from gz_onboard.physics.effect import MOVING, Port
+from gz_onboard.physics.model import Model, Recall, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
+
+if TYPE_CHECKING:
+    from gz_onboard.estimator.consumption import ConsumptionLearner
+    from gz_onboard.estimator.motion import Motion, VibrationMonitor
+    from gz_onboard.estimator.signals import Signals
+    from gz_onboard.estimator.soc import StateOfCharge
+    from gz_onboard.estimator.temperatures import Temperatures
 
 Quantities = dict[str, float]
 """Inputs of effects by name: see `physics.effect.QUANTITIES`."""
@@ -49,22 +56,17 @@ BASE = {
 
 
 class Conditions(NamedTuple):
-    """Conditions that the consumption depends on besides the motion."""
+    """Conditions that the load depends on besides speed, acceleration and grade; typical ones in place of None."""
 
     ambient: float  # degC
     altitude: float  # m
     motor_temperature: float = WARM_MOTOR  # degC
-
-
-class EffectInputs(NamedTuple):
-    """Inputs of effects beyond the base's at one time; None where unknown."""
-
-    lateral_acceleration: float | None  # m/s²
-    heading: float | None  # rad, clockwise from north
-    soc: float
-    cell_temperature: float  # degC
-    current: float  # A of the pack
+    lateral_acceleration: float | None = None  # m/s²
+    heading: float | None = None  # rad, clockwise from north; None: the mean over all
     vibration: float | None = None  # m/s²
+    soc: float = HALF_FULL
+    cell_temperature: float | None = None  # degC; None: as the air
+    current: float = 0.0  # A of the pack
 
 
 @dataclass
@@ -78,8 +80,8 @@ class Ledger:
 class LoadModel:
     """Forward model of one vehicle with the inputs that are typical for it.
 
-    extended: it reads `EffectInputs`; ledger: kept of the riding if there is one, which on board there is not; states:
-    of effects with memory between road and pack.
+    extended: the road load reads more than `BASE`; ledger: kept of the riding if there is one, which on board there is
+    not; states: of effects with memory between road and pack.
     """
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
@@ -87,92 +89,147 @@ class LoadModel:
         self.prior = prior
         self.ledger: Ledger | None = None
         self.states: dict[str, float] = {}
-        self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
+        road = [effect for effect in model.effects if effect.port is not Port.CELL_VOLTAGE]
+        reads = frozenset[str]().union(*(effect.reads for effect in road))
+        memory = any(effect.decay for effect in road)
+        self.extended = memory or not reads <= BASE
+        self._repeats = not memory and not reads & {"heading", "time_moving"}  # riding it again takes the same
+        self._by_heading = "heading" in reads
         self._battery = battery
-        self._by_heading = "heading" in model.reads
-        self._prior_prices = lru_cache(KEPT_AIRS)(self._prior_prices_in)
+        self._prices = lru_cache(KEPT_AIRS)(self._model_prior)
 
-    def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
-        """Inputs of the base model on a level road without wind; speed [m/s], acceleration [m/s²]."""
-        return {
+    def quantities(
+        self, speed: float, acceleration: float, conditions: Conditions, grade: float = 0.0, time_moving: float = AHEAD
+    ) -> Quantities:
+        """Inputs of the model at `speed` [m/s], `acceleration` [m/s²], `grade` (sine), `time_moving` [s]."""
+        c, prior = conditions, self.prior
+        q = {
             "speed": speed,
             "acceleration": acceleration,
-            "grade": 0.0,
+            "grade": grade,
             "grade_cosine": 1.0,
             "headwind": 0.0,
             "mass": self.model.mass,
-            "air_density": air_density(conditions.ambient, conditions.altitude),
-            "motor_temperature": conditions.motor_temperature,
-            "lateral_acceleration": 0.0,
+            "air_density": air_density(c.ambient, c.altitude),
+            "motor_temperature": c.motor_temperature,
         }
+        if self.extended:
+            lateral, vibration = c.lateral_acceleration, c.vibration
+            cells = c.ambient if c.cell_temperature is None else c.cell_temperature
+            q |= {
+                "lateral_acceleration": prior.lateral_acceleration * (speed > MOVING) if lateral is None else lateral,
+                "vibration": prior.vibration * (speed > MOVING) if vibration is None else vibration,
+                "time_moving": time_moving,
+                "ambient_temperature": c.ambient,
+                "soc": c.soc,
+                "cell_temperature": cells,
+                "cell_current": c.current / self._battery.cells_parallel,
+                "cell_capacity": self._battery.cell_capacity(cells),
+            }
+            if c.heading is not None:
+                q["heading"] = c.heading
+        return q
 
-    def extend(self, q: Quantities, inputs: EffectInputs, ambient: float, time_moving: float) -> None:
-        """Add to `q` the inputs of an extended model; ambient in degC, time_moving in s."""
-        lateral, typical = inputs.lateral_acceleration, self.prior.lateral_acceleration
-        if lateral is None:
-            lateral = typical if q["speed"] > MOVING else 0.0
-        q |= {
-            "lateral_acceleration": lateral,
-            "vibration": self.typical_vibration(q["speed"]) if inputs.vibration is None else inputs.vibration,
-            "heading": 0.0 if inputs.heading is None else inputs.heading,
-            "time_moving": time_moving,
-            "ambient_temperature": ambient,
-            "soc": inputs.soc,
-            "cell_temperature": inputs.cell_temperature,
-            "cell_current": inputs.current / self._battery.cells_parallel,
-            "cell_capacity": self._battery.cell_capacity(inputs.cell_temperature),
-        }
-
-    def typical_vibration(self, speed: float) -> float:
-        """Vibration of the prior riding [m/s²] at `speed` [m/s], where it is unknown."""
-        return self.prior.vibration if speed > MOVING else 0.0
+    def powers(self, q: Quantities, recall: Recall | None = None) -> dict[str, float]:
+        """Power at the pack [W] by effect; those with memory as `recall` gives them, or settled. See `Model.power`."""
+        if self._by_heading and "heading" not in q:
+            every = [self.model.power(q | {"heading": heading}) for heading in HEADINGS]
+            return {name: sum(each[name] for each in every) / len(every) for name in every[0]}
+        return self.model.power(q, recall)
 
     def power(self, q: Quantities) -> float:
         """Power at the pack [W] with all effects settled."""
-        return float(sum(self.model.power(q).values()))
+        return float(sum(self.powers(q).values()))
 
-    def power_ridden(self, q: Quantities, inputs: EffectInputs | None, dt: float) -> tuple[float, float]:
-        """(power [W] over the last `dt` [s], power of riding the same again); a step of effects with memory.
-
-        inputs: that `q` was extended by, None for the base's quantities alone.
-        """
-        if inputs and self._by_heading and inputs.heading is None:
-            ledgers = [self.model.power(q | {"heading": heading}) for heading in HEADINGS]
-        else:
-            ledgers = [self.model.power(q, stepping(self.states, dt) if inputs else None)]
+    def power_ridden(self, q: Quantities, dt: float) -> tuple[float, float]:
+        """(power [W] over the last `dt` [s], power of riding the same again); a step of effects with memory."""
+        powers = self.powers(q, stepping(self.states, dt))
         if self.ledger:
-            for name in ledgers[0]:
-                self.ledger.modelled[name] += sum(each[name] for each in ledgers) * dt / len(ledgers)
-        power = float(sum(sum(each.values()) for each in ledgers)) / len(ledgers)
-        return power, self.power_ahead(q | {"time_moving": q["time_moving"] + AHEAD}) if inputs else power
+            for name, watts in powers.items():
+                self.ledger.modelled[name] += watts * dt
+        power = float(sum(powers.values()))
+        if self._repeats:
+            return power, power
+        again = q | {"time_moving": q["time_moving"] + AHEAD}
+        again.pop("heading", None)
+        return power, self.power(again)
 
-    def power_ahead(self, q: Quantities) -> float:
-        """Power [W] with all effects settled, in the mean over all headings if the model reads the heading."""
-        if not self._by_heading:
-            return self.power(q)
-        return sum(self.power(q | {"heading": heading}) for heading in HEADINGS) / len(HEADINGS)
+    def prior_prices(self, ambient: float, altitude: float, mass: float | None = None) -> tuple[float, float]:
+        """Energy per metre of the prior riding [J/m], in motion and at its stops.
 
-    def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
-        """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
-        return sum(self.prior_prices(ambient, altitude)) * self.prior.speed, self.prior.speed
+        ambient in degC, altitude in m; mass: with rider and luggage [kg], by default as entered.
+        """
+        return self._prices(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS), mass or self.model.mass)
 
-    def prior_prices(self, ambient: float, altitude: float) -> tuple[float, float]:
-        """Energy per metre of the prior riding [J/m], in motion and at its stops; see `prior_ride`."""
-        return self._prior_prices(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS))
-
-    def usual_force(self) -> float:
-        """Mean force [N] of the prior riding: its energy at the pack over its distance."""
-        return self.prior.factor * sum(self.prior_prices(*USUAL_AIR))
-
-    def _prior_prices_in(self, ambient: float, altitude: float) -> tuple[float, float]:
+    def _model_prior(self, ambient: float, altitude: float, mass: float) -> tuple[float, float]:
         moving = standing = 0.0
         for share, speed, acceleration in self.prior.points:
-            q = self.quantities(speed, acceleration, Conditions(ambient, altitude))
-            if self.extended:
-                self.extend(q, EffectInputs(None, None, HALF_FULL, ambient, 0.0), ambient, AHEAD)
-            price = share * self.power_ahead(q) * self.prior.unevenness / self.prior.speed
+            q = self.quantities(speed, acceleration, Conditions(ambient, altitude)) | {"mass": mass}
+            price = share * self.power(q) * self.prior.unevenness / self.prior.speed
             if speed > MOVING:
                 moving += price
             else:
                 standing += price
         return moving, standing
+
+
+class PresentLoad:
+    """Load of the vehicle as it moves now, by the forward model. All methods take the time [s]."""
+
+    def __init__(
+        self,
+        learner: ConsumptionLearner,
+        motion: Motion,
+        temperatures: Temperatures,
+        soc: StateOfCharge,
+        monitor: VibrationMonitor | None,
+        signals: Signals,
+    ) -> None:
+        """monitor: for a model that reads the vibration."""
+        self._learner, self._load, self._motion, self._temperatures = learner, learner.load, motion, temperatures
+        self._soc, self._monitor, self._motor_temperature = soc, monitor, signals.motor_temperature
+
+    def conditions(self, now: float) -> Conditions:
+        """Conditions of the riding, as far as they are known."""
+        motion, motor = self._motion, self._motor_temperature.get(now)
+        ambient, altitude = self._temperatures.ambient(now), motion.altitude or 0.0
+        if not self._load.extended:
+            return Conditions(ambient, altitude, WARM_MOTOR if motor is None else motor)
+        filter_, turning = self._soc.filter, motion.yaw_rate is not None and motion.speed is not None
+        return Conditions(
+            ambient,
+            altitude,
+            WARM_MOTOR if motor is None else motor,
+            (motion.speed or 0.0) * (motion.yaw_rate or 0.0) if turning else None,
+            motion.heading,
+            self._monitor.value(now) if self._monitor else None,
+            filter_.soc if filter_ else HALF_FULL,
+            self._temperatures.cells_or_bench,
+            self._soc.current or 0.0,
+        )
+
+    def power(self, now: float) -> float:
+        """Power that the pack gives [W]."""
+        motion = self._motion
+        return self.power_at(now, motion.speed or 0.0, motion.acceleration or 0.0, motion.grade or 0.0)
+
+    def power_at(self, now: float, speed: float, acceleration: float, grade: float = 0.0) -> float:
+        """Power that the pack would give [W] at this speed [m/s], acceleration [m/s²] and grade (sine)."""
+        moving = self._learner.time_moving
+        return self._load.power(self._load.quantities(speed, acceleration, self.conditions(now), grade, moving))
+
+    def power_of_prior(self, now: float) -> float:
+        """Power of the riding before the first voltage [W]: the prior's, or, where it rides faster, at its speed."""
+        conditions, speed, usual = self.conditions(now), self._motion.speed or 0.0, self._load.prior.speed
+        power = sum(self._load.prior_prices(conditions.ambient, conditions.altitude)) * usual
+        return max(power, self.power_at(now, speed, 0.0)) if speed > usual else power
+
+    def cell_inputs(self, now: float) -> dict[str, float]:
+        """Inputs of effects in the cells, apart from those of the cells themselves."""
+        inputs = {"time_moving": self._learner.time_moving}
+        return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
+
+    def vibration(self, now: float) -> float:
+        """Vibration that effects read [m/s²]: the typical value while it is not known."""
+        value = self._monitor.value(now) if self._monitor else None
+        return self._load.prior.vibration * ((self._motion.speed or 0.0) > MOVING) if value is None else value

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.interval import DECILE, deciles
-from gz_onboard.estimator.load_model import Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.load_model import Conditions, LoadModel
 from gz_onboard.estimator.motion import Motion
 from gz_onboard.estimator.route_position import HeightCheck, RoutePosition
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import Estimate, RouteState
-from gz_onboard.physics.battery import HALF_FULL
 from gz_onboard.physics.drawable import soc_left
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
@@ -132,17 +131,16 @@ class PreparedRoute:
         self, load: LoadModel, air: Conditions, speed: Array, acceleration: Array, moving: Array, hills: bool
     ) -> Array:
         """Power at the pack [W] on each piece, at speed [m/s], acceleration [m/s²] and time moving [s], each (n-1,)."""
-        q: dict[str, Any] = load.quantities(speed, acceleration, air)  # type: ignore[arg-type]
+        pieces = self._pieces
+        bends: Any = air._replace(
+            lateral_acceleration=speed * speed * pieces["curvature"],
+            heading=pieces["heading"],
+            vibration=load.prior.vibration * (speed > MOVING),  # type: ignore[arg-type]
+        )
+        q: dict[str, Any] = load.quantities(speed, acceleration, bends, time_moving=moving)  # type: ignore[arg-type]
         if hills:
-            grade = self._pieces["grade"]
-            q |= {"grade": grade, "grade_cosine": root(1 - grade * grade)}
-        q["headwind"] = self._pieces["headwind"]
-        if load.extended:
-            lateral: Any = speed * speed * self._pieces["curvature"]
-            heading: Any = self._pieces["heading"]
-            vibration: Any = load.prior.vibration * (speed > MOVING)
-            time: Any = moving
-            load.extend(q, EffectInputs(lateral, heading, HALF_FULL, air.ambient, 0.0, vibration), air.ambient, time)
+            q |= {"grade": pieces["grade"], "grade_cosine": root(1 - pieces["grade"] ** 2)}
+        q["headwind"] = pieces["headwind"]
         power: Array = self._np.zeros(len(speed)) + sum(load.model.power(q).values())
         return power
 

@@ -11,7 +11,7 @@ from gz_onboard.estimator.cell_effects import LARGEST
 from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.saved_fields import Each, Number, check
 
-VERSION = 5
+VERSION = 6
 """Raised with every change of a field; a state of another version is not read."""
 
 FIELDS: Mapping[str, Any] = {

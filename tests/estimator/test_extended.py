@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.load_model import Conditions, EffectInputs, Ledger
+from gz_onboard.estimator.load_model import Conditions, Ledger
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
@@ -58,10 +58,10 @@ def test_the_ledger_is_what_the_forecast_models(vehicle, heading):
     for ledger in (None, Ledger()):
         f = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
         f.load.ledger = ledger
-        inputs = EffectInputs(0.0, heading, 0.5, 25.0, 10.0) if f.load.extended else None
+        air = AIR._replace(lateral_acceleration=0.0, heading=heading)
         for second in range(240):
-            f.learner.ride(1.0, 10.0 + 2 * math.sin(second / 5), 0.01, 900.0, AIR, inputs)
-        results.append([f.learner.state.sums, f.learner.pattern.points(), f.learner._segment])
+            f.learner.ride(1.0, 10.0 + 2 * math.sin(second / 5), 0.01, 900.0, air)
+        results.append([f.learner.state, f.learner._segment])
     assert results[0] == results[1]
     assert ledger is not None
     assert ledger.measured == pytest.approx(240 * 900.0)
@@ -224,10 +224,10 @@ def ride(f, truth, kilometres, *, heading=0.0, radius=0.0):
         a = min(max(0.5 * (target - v), -1.2), 0.9)
         lateral = (1 if x % 200 < 100 else -1) * v * v / radius if radius else 0.0
         moving += 0.1 if v > 0.5 else 0.0
-        inputs = EffectInputs(lateral, heading, 0.6, 20.0, 5.0)
+        air = AIR._replace(lateral_acceleration=lateral, heading=heading)
         q = f.load.quantities(v, a, AIR) | {"lateral_acceleration": lateral, "heading": heading}
         power = sum(truth.power(q | {"time_moving": moving}).values())
-        f.learner.ride(0.1, v, 0.0, power, AIR, inputs if f.load.extended else None)
+        f.learner.ride(0.1, v, 0.0, power, air)
         x += v * 0.1
         v += a * 0.1
     return f

@@ -135,7 +135,7 @@ def given_on_the_way(route: Route) -> Explanation:
     """The change of the range with the route, in causes."""
     rider = Rider()
     free = rider.forecaster.forecast(0.7, 0.01, 20.0, 1.0, AIR.ambient, AIR.altitude)
-    explainer = RangeExplainer(rider.forecaster, rider.signals)
+    explainer = RangeExplainer(rider.forecaster)
     for now, road in enumerate((None, rider.forecast.prepare(route))):
         rider.forecast.follow(road)
         found, _ = rider.settled(free)
