@@ -61,7 +61,7 @@ def errors(work: tuple[Path, Path, str, float]) -> tuple[Array, Array, Array]:
     vehicle = read_vehicle(vehicle_file)
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = EventEstimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
-    estimator._outlook._time = float("inf")  # no range is asked for
+    estimator.forecaster._time = float("inf")  # no range is asked for
     found = np.full((2, len(rows)), np.nan)
     told = False
     for k, (time, current, volts, _) in enumerate(rows.tolist()):

@@ -247,7 +247,7 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
     model = Model(tuple(e for e in vehicle.model.effects if beside.get(e.name, True)), Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = EventEstimator(groups, battery, model, vehicle.riding, setting.make)
-    estimator._outlook._time = float("inf")  # no range is asked for
+    estimator.forecaster._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
     cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator._load
     power_of_prior = load.power_of_prior

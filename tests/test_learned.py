@@ -67,7 +67,7 @@ def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     estimator.restore(snapshot, vehicle.key, 0.0)
     learner = estimator.forecaster.learner
     price = replace(learner.habits.price, level=1.2, level_variance=0.01**2)
-    learner.state = replace(learner.state, habits=replace(learner.habits, price=price))
+    learner.state = replace(learner.state, habits=learner.habits._replace(price=price))
     estimator.forecaster.ridden_by("anna")
     estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
     changed = estimator.snapshot(vehicle.key)

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -128,8 +127,7 @@ def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
 
 def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
     learned = {}
-    for name in (field.name for field in fields(Habits)):
-        now, before = getattr(habits, name), getattr(prior, name)
+    for name, now, before in zip(Habits._fields, habits, prior, strict=True):
         share = 1 - sqrt(now.level_variance / before.level_variance)
         learned[name] = Learned(now.level / before.level, sqrt(now.level_variance) / before.level, max(share, 0.0))
     return learned

@@ -29,11 +29,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf, isfinite, sqrt
 
-from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.constants import BENCH_TEMPERATURE, DECILE
 from gz_onboard.estimator.ageing_fit import COMPARED, RESISTANCE, RESISTANCE_MEMORY, Fit, believed
 from gz_onboard.estimator.ageing_kinds import RESISTANCE_AGED_SD, Belief, Kinds
 from gz_onboard.estimator.ekf import Covariance, SocFilter
-from gz_onboard.estimator.interval import DECILE
 from gz_onboard.estimator.saved_fields import FINITE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import erf, exp, inf, isinf, sqrt
 from typing import NamedTuple
 
-from gz_onboard.estimator.interval import DECILE
+from gz_onboard.constants import DECILE
 
 RESISTANCE_AGED_SD = 0.42  # of packs that are not as new
 TOGETHER = 0.8  # of their ψ and resistance: cells of one kind that were aged in many ways (Schuster et al. 2016)

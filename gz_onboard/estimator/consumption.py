@@ -1,4 +1,4 @@
-"""Consumption of the riding: what a metre costs and how long it takes, learned for each rider.
+"""Consumption of the riding: energy and time per metre, learned for each rider.
 
 The riding is gathered by the second, and the seconds in segments of 250 m. Of each segment the pack's energy is
 compared with the forward model's, which gives four quantities (`Habits`). The first three are relative to the prior
@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
-from math import exp, sqrt
-from typing import Any
+from math import exp, inf, sqrt
+from typing import Any, NamedTuple
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
@@ -40,7 +40,7 @@ class ConsumptionConfig:
     # Gathering
     segment_m: float = 250.0  # one update of the filters; in town, neighbours of this length are hardly alike
     memory_m: float = 12_000.0  # sums of the riding fade to 1/e over this
-    recent_m: float = 1000.0  # the same of what a rider calls recent consumption
+    recent_m: float = 1000.0  # the same for the recent consumption
     prior_m: float = 3000.0  # riding that the prior riding counts for in the sums
     history_segments: int = 40  # 10 km that a fault found later can be unlearned of
     steepest: float = 0.3  # sine: no road is steeper
@@ -56,7 +56,7 @@ class ConsumptionConfig:
     ride_share: float = 0.1  # weight of one ride in the variance from ride to ride: about the last ten count
     least_sd: float = 0.005  # no riding is more even
     outlier_sd: float = 4.0  # a segment that differs by more is a faulty sensor or a wait for a ferry, and is clipped
-    most: float = 10.0  # of any quantity; all are about 1, and a heated van in a jam takes 5 times what the model says
+    most: float = 10.0  # of any quantity; all are about 1, and a heated van in a jam takes 5 times the modelled energy
     most_variance: float = 4.0
     doubt: float = 1.25  # sd over the change that a faulty sensor taught: price and stops may err alike
     # Priors: sd of the level, from ride to ride, and of a segment
@@ -135,7 +135,7 @@ class Quantity:
         residual = min(max(residual + (1 - fade) * self.deviation, -most), most)
         gain, own_gain = (level + both) / total, (both + own) / total
         return Quantity(
-            min(max(self.level + gain * residual, -c.most), c.most),
+            min(max(self.level + gain * residual, 0.0), c.most),
             level - gain * (level + both),
             self.ride_variance,
             self.scatter,
@@ -158,30 +158,21 @@ class Quantity:
         c = CONSUMPTION
         seen = self.deviation**2 + self.deviation_variance
         ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
-        ride_variance = min(max(ride_variance, c.least_sd**2), c.most_variance)
-        return Quantity(self.level, self.level_variance, ride_variance, self.scatter)
+        return Quantity(
+            self.level, self.level_variance, min(max(ride_variance, c.least_sd**2), c.most_variance), self.scatter
+        )
 
     def doubted(self, seen: float) -> Quantity:
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
         more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
         return replace(self, deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
 
-    def of_another_rider(self) -> Quantity:
-        """State for a rider who has never ridden."""
-        return replace(self, level_variance=self.level_variance + CONSUMPTION.level_sd**2)
-
     def scaled(self, by: float) -> Quantity:
         """The same quantity in a unit that is `by` times smaller."""
-        numbers = asdict(self)
-        for name in ("level", "deviation"):
-            numbers[name] *= by
-        for name in ("level_variance", "ride_variance", "scatter", "deviation_variance", "covariance"):
-            numbers[name] *= by * by
-        return Quantity(**numbers)
+        return Quantity(*(x * by**power for x, power in zip(astuple(self), (1, 2, 2, 2, 1, 2, 2), strict=True)))
 
 
-@dataclass(frozen=True, slots=True)
-class Habits:
+class Habits(NamedTuple):
     """Riding of one rider. All but the factor are in units of the prior riding."""
 
     price: Quantity
@@ -193,40 +184,17 @@ class Habits:
     def before(cls, prior: PriorRiding, stops: float) -> Habits:
         """Before anything is ridden; stops: of the prior riding."""
         c = CONSUMPTION
-
-        def quantity(level: float, sd: float, ride_sd: float, scatter_sd: float) -> Quantity:
-            return Quantity(level, sd**2, ride_sd**2, scatter_sd**2)
-
-        scatter = max(c.price_scatter * prior.drift, c.least_sd)
-        return cls(
-            quantity(prior.factor, sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, scatter),
-            quantity(stops, *c.stops_sd),
-            quantity(1.0, *c.pace_sd),
-            quantity(prior.factor, prior.factor_sd, *c.factor_sd),
-        )
+        price_sd = sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, max(c.price_scatter * prior.drift, c.least_sd)
+        levels = prior.factor, stops, 1.0, prior.factor
+        sds = price_sd, c.stops_sd, c.pace_sd, (prior.factor_sd, *c.factor_sd)
+        return cls(*(Quantity(level, *(sd * sd for sd in each)) for level, each in zip(levels, sds, strict=True)))
 
     def next_ride(self) -> Habits:
         """Before another ride."""
-        return Habits(*(quantity.next_ride() for quantity in self.all))
-
-    def doubted(self, seen: Habits) -> Habits:
-        """Without what a sensor in doubt has taught; `seen`: with it."""
-        return Habits(*(mine.doubted(its.now) for mine, its in zip(self.all, seen.all, strict=True)))
-
-    def scaled(self, price: float, pace: float) -> Habits:
-        """In units of a prior riding whose price and pace are so many times smaller."""
-        return Habits(
-            self.price.scaled(price), self.stops.scaled(price), self.pace.scaled(pace), self.factor.scaled(price)
-        )
-
-    @property
-    def all(self) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-        """In the order of the fields."""
-        return self.price, self.stops, self.pace, self.factor
+        return Habits(*(quantity.next_ride() for quantity in self))
 
 
-@dataclass(slots=True)
-class Segment:
+class Segment(NamedTuple):
     """Sums over some riding; energies in J at the pack's terminals, without auxiliaries beyond the file's."""
 
     distance: float = 0.0  # m
@@ -249,15 +217,15 @@ class Segment:
         """All that was measured, with those auxiliaries [J]."""
         return self.measured + self.stops + self.auxiliary
 
-    def faded(self, segment: Segment, memory: float) -> Segment:
+    def followed_by(self, segment: Segment, memory: float = inf) -> Segment:
         """These sums, weighted down over a `memory` [m], with those of a `segment` that came after."""
         fade = exp(-segment.distance / memory)
-        return Segment(*(fade * old + new for old, new in zip(astuple(self), astuple(segment), strict=True)))
+        return Segment(*(fade * old + new for old, new in zip(self, segment, strict=True)))
 
 
 @dataclass(slots=True)
 class Second:
-    """What is gathered until the model is asked."""
+    """Sums until the model is asked."""
 
     start_speed: float | None = None  # m/s
     seconds: float = 0.0
@@ -273,7 +241,7 @@ class Second:
 class Terrain:
     """How far roads climb or fall in the end, where no route tells the hills ahead.
 
-    A hill gives back what it took, but for losses, which are part of the price of a metre. The height at which a way
+    A hill gives its energy back, but for losses, which are part of the price of a metre. The height at which a way
     ends is unknown and grows as a random walk. Its rate is the mean square of the net climbs over stretches of 4 km,
     with a prior.
     """
@@ -307,59 +275,45 @@ class Terrain:
         return self.rate * way * min(way / CONSUMPTION.stretch_m, 1.0)
 
 
+@dataclass(slots=True)
 class AuxiliaryPower:
-    """Power of auxiliaries beyond the vehicle file's, as their own current sensor shows it; 0 if none does.
+    """Power of auxiliaries [W] beyond the vehicle file's, as their own sensors show it; 0 if none does.
 
     At standstill the pack's power shows nothing: a motor that holds the vehicle on a hill looks like a heater.
     """
 
-    def __init__(self, model: Model) -> None:
-        modelled = any(p.name == "auxiliary_power" for effect in model.effects for p in effect.parameters)
-        self._modelled = model.parameters["auxiliary_power"] if modelled else 0.0  # W
-        self.now = self.mean = 0.0  # W beyond that
-        self._seen = 0.0  # s that the mean is of
+    modelled: float  # the vehicle file's
+    now: float = 0.0
+    mean: float = 0.0
+    seen: float = 0.0  # s that the mean is of
 
     def step(self, dt: float, total: float | None, loads: float | None = None) -> None:
         """Take in `dt` [s] of the power of all auxiliaries [W]; without it, that of heater and air conditioner alone.
 
         None: not measured.
         """
-        beyond = loads if total is None else total - self._modelled
+        beyond = loads if total is None else total - self.modelled
         if beyond is None:
             self.now = self.mean
             return
         self.now = beyond
-        self._seen = min(self._seen + dt, CONSUMPTION.auxiliary_mean_s)
-        if self._seen > 0:
-            self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
-
-    @property
-    def total(self) -> float:
-        """Power of all auxiliaries now [W]."""
-        return self._modelled + self.now
+        self.seen = min(self.seen + dt, CONSUMPTION.auxiliary_mean_s)
+        if self.seen > 0:
+            self.mean += min(dt / self.seen, 1.0) * (beyond - self.mean)
 
     def forget(self) -> None:
-        """Drop what a faulty sensor has shown."""
-        self.now = self.mean = self._seen = 0.0
-
-    def snapshot(self) -> float:
-        """Mean power of all auxiliaries [W], to be kept over a restart."""
-        return self._modelled + self.mean
-
-    def restore(self, saved: float) -> None:
-        """Take `snapshot` until something is measured."""
-        self._seen = 0.0
-        self.now = self.mean = saved - self._modelled
+        """Drop the values of a faulty sensor."""
+        self.now = self.mean = self.seen = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class RidingState:
-    """What the learner has learned by the end of a segment."""
+    """State of the learner at the end of a segment."""
 
     habits: Habits
     sums: Segment = field(default_factory=Segment)  # faded over `memory_m`
     recent: Segment = field(default_factory=Segment)  # faded over `recent_m`
-    terrain: Terrain = field(default_factory=Terrain)
+    terrain: Terrain = Terrain()
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,14 +326,9 @@ class ExpectedRiding:
     variance: float  # of the consumption over the way to come, relative
     least: float  # J/m: no riding takes less
 
-    @property
-    def load(self) -> tuple[float, float]:
-        """Mean power [W] and the square of its form factor."""
-        return self.power, self.form_factor_squared
-
 
 class ConsumptionLearner:
-    """Learns what the riding of one vehicle costs. `state` is replaced as a whole at the end of each segment."""
+    """Learns the consumption of one vehicle. `state` is replaced as a whole at the end of each segment."""
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.load = LoadModel(model, battery, prior)
@@ -387,11 +336,11 @@ class ConsumptionLearner:
         self.prior_price = moving + stops  # J/m: with the prior's speed, the unit of saved habits
         self.prior = Habits.before(prior, stops / moving)
         self.state = RidingState(self.prior)
-        self.auxiliaries = AuxiliaryPower(model)
+        modelled = any(p.name == "auxiliary_power" for effect in model.effects for p in effect.parameters)
+        self.auxiliaries = AuxiliaryPower(model.parameters["auxiliary_power"] if modelled else 0.0)
         self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
         self.distance = 0.0  # m ridden, without towed metres
         self.rides = 0  # that have ended
-        self.time_moving = 0.0  # s, since the start or the last long standstill
         self.still = 0.0  # s since the last motion
         self.towed = False
         self._coasted = self._unexplained = 0.0  # m without the motor, and J that nothing explains on them
@@ -482,60 +431,60 @@ class ConsumptionLearner:
         conditions: Conditions,
         period: float = 0.0,
         motor_power: float | None = None,
-    ) -> bool:
+    ) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s], `grade` (sine) and `power` [W] of the pack.
 
         period: of the speed's messages [s], as between two of them there is no acceleration; motor_power: into the
-        motor [W], None for all. Returns whether a segment was learned.
+        motor [W], None for all.
         """
         self._gather(dt, speed, grade, power, power if motor_power is None else motor_power)
-        second, segment, c = self._second, self._segment, CONSUMPTION
+        second, c = self._second, CONSUMPTION
         if second.seconds < max(1.0, period):
-            return False
+            return
         start = speed if second.start_speed is None else second.start_speed
         mean, acceleration = second.distance / second.seconds, (speed - start) / second.seconds
         if abs(acceleration) > c.acceleration_limit:  # a sensor errs, or the wheel spins
             self.pause()
-            return False
-        grade_seen, moving = 0.0, abs(mean) > MOVING
-        if moving:
-            grade_seen = max(min(second.climb / abs(second.distance), c.steepest), -c.steepest)
-        q = self.load.quantities(mean, acceleration, conditions, grade_seen, self.time_moving)
+            return
+        way, moving = abs(second.distance), abs(mean) > MOVING
+        slope = max(min(second.climb / way, c.steepest), -c.steepest) if moving else 0.0
+        q = self.load.quantities(mean, acceleration, conditions, slope, self.load.time_moving)
         modelled, repeated = (second.seconds * power for power in self.load.power_ridden(q, second.seconds))
         stored = self._weight * second.climb + self._moving_mass * (speed * speed - start * start) / 2
         auxiliary = self.auxiliaries.now * second.seconds
+        measured = second.energy - auxiliary
         if moving and grade is not None:
-            self._watch_towing(modelled - (repeated - stored + second.energy - auxiliary) / 2)
+            self._watch_towing(modelled - (repeated - stored + measured) / 2)
             if self.towed:
                 self.pause()
-                return False
+                return
         if self.load.ledger:
             self.load.ledger.measured += second.energy
         if moving:
             self.still = 0.0
-            segment.measured += second.energy - auxiliary
-            segment.modelled += modelled
-            segment.level += repeated
         else:
             self._stand(second.seconds)
-        if self.still <= MOTION.stop_time:  # a longer stop takes energy, but teaches nothing
-            segment.stops += 0.0 if moving else second.energy - auxiliary
-            segment.auxiliary += auxiliary
-            segment.duration += second.seconds
-            segment.squares += second.squares
-        segment.level -= stored
-        segment.climb += second.climb
-        segment.unseen += second.unseen
-        way = abs(second.distance)
-        segment.distance += way
-        segment.speed_squares += mean * mean * way
-        segment.grade_squares += grade_seen * grade_seen * way
-        segment.lateral_squares += q.get("lateral_acceleration", 0.0) ** 2 * way
+        short = self.still <= MOTION.stop_time  # a longer stop takes energy, but teaches nothing
         self._second = Second(start_speed=speed)
-        if segment.distance < c.segment_m:
-            return False
-        self._close(conditions)
-        return True
+        self._segment = self._segment.followed_by(
+            Segment(
+                distance=way,
+                duration=second.seconds if short else 0.0,
+                measured=measured if moving else 0.0,
+                stops=measured if short and not moving else 0.0,
+                auxiliary=auxiliary if short else 0.0,
+                squares=second.squares if short else 0.0,
+                modelled=modelled if moving else 0.0,
+                level=(repeated if moving else 0.0) - stored,
+                unseen=second.unseen,
+                climb=second.climb,
+                speed_squares=mean * mean * way,
+                grade_squares=slope * slope * way,
+                lateral_squares=q.get("lateral_acceleration", 0.0) ** 2 * way,
+            )
+        )
+        if self._segment.distance >= c.segment_m:
+            self._close(conditions)
 
     def _gather(self, dt: float, speed: float, grade: float | None, power: float, motor: float) -> None:
         second, way = self._second, abs(speed) * dt
@@ -550,13 +499,13 @@ class ConsumptionLearner:
             second.unseen += way
         else:
             second.climb += grade * speed * dt
-        self.time_moving += dt if speed > MOVING else 0.0
+        self.load.time_moving += dt if speed > MOVING else 0.0
         self.distance += 0.0 if self.towed else way
 
     def _watch_towing(self, unexplained: float) -> None:
         """Unlearn the metres that something else has paid for: road and bus leave too much energy unexplained.
 
-        unexplained: of the second [J], what the model asks for beyond half of a level road's and of what was measured.
+        unexplained: of the second [J], modelled energy beyond half of a level road's and of the measured energy.
         """
         distance, limit = abs(self._second.distance), CONSUMPTION.height_error_m * self._weight
         if self._second.motor > CONSUMPTION.driving_force * self._weight * distance:
@@ -570,10 +519,10 @@ class ConsumptionLearner:
 
     def _close(self, conditions: Conditions) -> None:
         """Learn from the segment that has ended."""
-        c, segment, state, speed = CONSUMPTION, self._segment, self.state, self.load.prior.speed
-        way, habits = segment.distance, state.habits
+        c, state, speed = CONSUMPTION, self.state, self.load.prior.speed
+        way, habits = self._segment.distance, state.habits
         moving, stops = self.load.prior_prices(conditions.ambient, conditions.altitude)
-        unit, segment.prior = moving * way, (moving + stops) * way
+        unit, segment = moving * way, self._segment._replace(prior=(moving + stops) * way)
         unseen, factor = segment.unseen / way, habits.factor.now
         paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
         # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
@@ -589,8 +538,8 @@ class ConsumptionLearner:
         self._history.append((way, state))
         self.state = RidingState(
             learned,
-            state.sums.faded(segment, c.memory_m),
-            state.recent.faded(segment, c.recent_m),
+            state.sums.followed_by(segment, c.memory_m),
+            state.recent.followed_by(segment, c.recent_m),
             state.terrain.ridden(way, segment.climb, segment.unseen),
         )
         self._segment = Segment()
@@ -608,12 +557,13 @@ class ConsumptionLearner:
         seen = self.habits
         self.pause()
         self._revert(distance)
-        self.state = replace(self.state, habits=self.habits.doubted(seen))
+        doubted = (mine.doubted(its.now) for mine, its in zip(self.habits, seen, strict=True))
+        self.state = replace(self.state, habits=Habits(*doubted))
 
     def ridden_by(self, rider: str) -> None:
         """Have `rider` ride from now on.
 
-        Who has never ridden is taken to ride as the one before, but less surely. What the parameters have wrong is the
+        A new rider is taken to ride as the one before, but less surely. Errors of the parameters are the
         vehicle's, whoever rides.
         """
         self.pause()
@@ -621,12 +571,16 @@ class ConsumptionLearner:
         self.other_riders[self.rider] = before
         habits = self.other_riders.pop(rider, None)
         if habits is None:
-            habits = replace(before, price=before.price.of_another_rider(), pace=before.pace.of_another_rider())
+            price, pace = (
+                replace(x, level_variance=x.level_variance + CONSUMPTION.level_sd**2)
+                for x in (before.price, before.pace)
+            )
+            habits = before._replace(price=price, pace=pace)
             if len(self.other_riders) > CONSUMPTION.most_riders:
                 del self.other_riders[next(iter(self.other_riders))]
         self.rider, self._segment = rider, Segment()
         self._history.clear()
-        self.state = RidingState(replace(habits, factor=before.factor), terrain=self.state.terrain)
+        self.state = RidingState(habits._replace(factor=before.factor), terrain=self.state.terrain)
 
     def pause(self, dt: float = 0.0) -> None:
         """Take in `dt` [s] that teach nothing: parked, or something is not known. Drop the unfinished second."""
@@ -639,7 +593,7 @@ class ConsumptionLearner:
             self.rides += 1
             self.state = replace(self.state, habits=self.habits.next_ride())
         if self.still >= CONSUMPTION.tyres_cool_s:
-            self.time_moving = 0.0
+            self.load.time_moving = 0.0
 
     # --- saving -------------------------------------------------------------------------------------------------
 
@@ -647,13 +601,18 @@ class ConsumptionLearner:
         """State to be kept over a restart."""
         return {
             "unit": {"price": self.prior_price, "speed": self.load.prior.speed},
-            "state": asdict(self.state),
+            "state": {
+                "habits": _saved(self.habits),
+                "sums": self.state.sums._asdict(),
+                "recent": self.state.recent._asdict(),
+                "terrain": asdict(self.state.terrain),
+            },
             "rider": self.rider,
-            "riders": {name: asdict(habits) for name, habits in self.other_riders.items()},
-            "auxiliary_power": self.auxiliaries.snapshot(),
+            "riders": {name: _saved(habits) for name, habits in self.other_riders.items()},
+            "auxiliary_power": self.auxiliaries.mean,
             "effects": dict(self.load.states),
             "still": self.still,
-            "time_moving": self.time_moving,
+            "time_moving": self.load.time_moving,
         }
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -664,44 +623,44 @@ class ConsumptionLearner:
         unit, state = saved["unit"], saved["state"]
         scales = unit["price"] / self.prior_price, self.load.prior.speed / unit["speed"]
         sums, recent, terrain = Segment(**state["sums"]), Segment(**state["recent"]), Terrain(**state["terrain"])
-        self.state = RidingState(_habits(state["habits"], scales), sums, recent, terrain)
+        self.state = RidingState(_restored(state["habits"], *scales), sums, recent, terrain)
         self.rider = saved["rider"]
-        self.other_riders = {name: _habits(habits, scales) for name, habits in saved["riders"].items()}
-        self.auxiliaries.restore(saved["auxiliary_power"])
+        self.other_riders = {name: _restored(habits, *scales) for name, habits in saved["riders"].items()}
+        mean = saved["auxiliary_power"]
+        self.auxiliaries = AuxiliaryPower(self.auxiliaries.modelled, mean, mean)
         self.load.states = dict(saved["effects"])
-        self.still, self.time_moving = saved["still"], saved["time_moving"]
+        self.still, self.load.time_moving = saved["still"], saved["time_moving"]
         self._segment, self._second = Segment(), Second()
         self._history.clear()
 
 
-def _habits(saved: Mapping[str, Mapping[str, float]], scales: tuple[float, float]) -> Habits:
-    """Habits out of `asdict` of them, scaled by price and pace; ValueError for a covariance that no filter has."""
-    habits = Habits(**{name: Quantity(**quantity) for name, quantity in saved.items()}).scaled(*scales)
-    for q in habits.all:
-        possible = all(abs(x) <= CONSUMPTION.most for x in astuple(q))
+def _saved(habits: Habits) -> dict[str, dict[str, float]]:
+    return {name: asdict(quantity) for name, quantity in habits._asdict().items()}
+
+
+def _restored(saved: Mapping[str, Mapping[str, float]], price: float, pace: float) -> Habits:
+    """Habits as saved, in units that are `price` and `pace` times smaller; ValueError for some that no riding has."""
+    scales = {"price": price, "stops": price, "pace": pace, "factor": price}
+    habits = Habits(**{name: Quantity(**quantity).scaled(scales[name]) for name, quantity in saved.items()})
+    for q in habits:
+        possible = q.level >= 0 and all(abs(x) <= CONSUMPTION.most for x in astuple(q))
         possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
         if not possible or q.covariance**2 > q.level_variance * q.deviation_variance * (1 + 1e-9):
             raise ValueError("is damaged: state.riding holds implausible habits")
     return habits
 
 
-def _numbers(of: type, number: Number = FINITE) -> dict[str, Number]:
-    return dict.fromkeys((f.name for f in fields(of)), number)
-
-
-_HABITS = {quantity.name: _numbers(Quantity) for quantity in fields(Habits)}
-_POSITIVE = Number(0.0, 1e12)
-_SUMS = _numbers(Segment, Number(-1e12, 1e12)) | dict.fromkeys(
-    ("distance", "duration", "squares", "unseen", "prior", "speed_squares", "grade_squares", "lateral_squares"),
-    _POSITIVE,
-)
+_HABITS = {name: {f.name: FINITE for f in fields(Quantity)} for name in Habits._fields}
+_POSITIVE, _ANY = Number(0.0, 1e12), Number(-1e12, 1e12)
+_SIGNED = "measured", "stops", "auxiliary", "modelled", "level", "climb"
+_SUMS = dict.fromkeys(Segment._fields, _POSITIVE) | dict.fromkeys(_SIGNED, _ANY)
 FIELDS = {
     "unit": dict.fromkeys(("price", "speed"), Number(1e-6, 1e6)),
     "state": {
         "habits": _HABITS,
         "sums": _SUMS,
         "recent": _SUMS,
-        "terrain": _numbers(Terrain, _POSITIVE) | {"climb": Number(-1e12, 1e12)},
+        "terrain": {f.name: _POSITIVE for f in fields(Terrain)} | {"climb": _ANY},
     },
     "rider": Text(CONSUMPTION.most_name_letters),
     "riders": Each(_HABITS, CONSUMPTION.most_riders),

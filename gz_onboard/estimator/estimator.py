@@ -17,7 +17,6 @@ from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import PresentLoad
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
-from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.plausibility import Plausibility
 from gz_onboard.estimator.plausibility.electrical import CellEvidence
 from gz_onboard.estimator.plausibility.residual import StepInputs
@@ -86,7 +85,6 @@ class Estimator:
         self._odometer_step = 0.0  # m, the largest of its counts; 0: it has not counted yet
         self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activity, self._reading = ActivityTracker(), PackReading()
-        self._outlook = Outlook(self.forecaster, battery, self.route)
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
@@ -95,7 +93,7 @@ class Estimator:
         self.soc = StateOfCharge(battery, model, make, self.signals, self.plausibility.pack.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
         self._load = PresentLoad(
-            self.forecaster.learner, self.motion, self._temperatures, self.soc, self._vibration, self.signals
+            self.forecaster.load, self.motion, self._temperatures, self.soc, self._vibration, self.signals
         )
 
     @property
@@ -136,14 +134,14 @@ class Estimator:
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self.signals.pause else at_rest)
-        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
+        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._load)
         self.weakest.step(now, self._reading, temperature, self.soc)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         if self.filter is None:
-            self._outlook.outdate()
-        elif self._outlook.due(now):
+            self.forecaster.outdate()
+        elif self.forecaster.due(now):
             self._look_ahead(now, self.filter, temperature)
 
     def _elapsed(self, now: float) -> float | None:
@@ -262,7 +260,8 @@ class Estimator:
             return voltage * current
         if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
             return torque * turning
-        return power - self.forecaster.learner.auxiliaries.total
+        auxiliaries = self.forecaster.learner.auxiliaries
+        return power - auxiliaries.modelled - auxiliaries.now
 
     def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
@@ -270,11 +269,12 @@ class Estimator:
         lost = sum([variance for reason, variance in _LOSS_VARIANCES if reason & missing])
         conditions = self._load.conditions(now)
         soc = self.soc.ageing.state_of_charge(filter_)
-        self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activity.now))
-        if self._outlook.forecast:
-            charging = self._activity.now is Activity.CHARGING
-            way = self.motion.distance, self.route.hills
-            self.explainer.take(now, self._outlook.forecast, soc[0], conditions, *way, charging)
+        activity, way = self._activity.now, (self.motion.distance, self.route.hills)
+        forecast = self.forecaster.step(
+            *(now, soc, cells, conditions, lost, self._reading, activity),
+            lambda free: self.route.forecast(now, free, soc, lost, conditions),
+        )
+        self.explainer.take(now, forecast, soc[0], conditions, *way, activity is Activity.CHARGING)
 
     # --- results ----------------------------------------------------------------------------------------------
 
@@ -298,8 +298,9 @@ class Estimator:
         estimate.v1, estimate.innovation_rms = filter_.v1, self.soc.gate.rms
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
-        self._outlook.report(estimate)
-        estimate.why = self.explainer.latest if self._outlook.forecast else None
+        self.forecaster.report(estimate)
+        self.route.report(estimate)
+        estimate.why = self.explainer.latest if self.forecaster.latest else None
         reasons = int(estimate.reasons)
         estimate.state = State.DEGRADED if reasons & _DEGRADING else State.VALID
         missing = reasons | int(self.signals.lacking)
@@ -332,7 +333,7 @@ class Estimator:
         return self.soc.snapshot(self.filter) | {
             "version": VERSION,
             "key": key,
-            "consumption": self._outlook.consumption,
+            "consumption": self.forecaster.consumption,
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": list(self.motion.gyro_bias),
             "riding": self.forecaster.snapshot(),

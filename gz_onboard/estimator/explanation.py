@@ -1,7 +1,7 @@
-"""Why the range is what it is: its difference from another range, split among causes that add up to it.
+"""Explanation of the range: its difference from another range, split among causes that add up to it.
 
 The range is E/c, the energy that can be drawn over the consumption expected. It is evaluated with some causes as they
-are now and the others as they were. A cause counts with what it changes in one order of the causes and in the reverse
+are now and the others as they were. A cause counts with its effect in one order of the causes and in the reverse
 order, on average. That is its Shapley value as far as causes act alone or in pairs, and it always adds up.
 
 The consumption is that of the prior riding in the same air, times the parts of the present riding in that unit:
@@ -208,7 +208,7 @@ class RangeExplainer:
         ridden = 0.0 if a is self.rated else b.ridden - a.ridden
         causes = dict.fromkeys((cause for cause in Cause if cause), 0.0)
         start, end = self._energy(a, b), self._energy(a, b, OF_ENERGY)
-        # The change of E/c is a sum over changes of E and of c, each times a mean of what it is divided by.
+        # The change of E/c is a sum over changes of E and of c, each times a mean of the divisor.
         per_energy = (1 / a.consumption + 1 / b.consumption) / 2
         per_cost = -(start + end) / 2 / (a.consumption * b.consumption)
         self._split(causes, OF_ENERGY, per_energy, lambda changed: self._energy(a, b, changed))
@@ -254,7 +254,7 @@ class RangeExplainer:
         learner, unit = self._forecaster.learner, sum(self._load.prior_prices(*USUAL_AIR))
         sums = learner.state.sums
         share = learner.price_known * sums.distance / (sums.distance + CONFIG.riding_m)
-        if not share:
+        if not (share and sums.prior and sums.speed_squares):
             return self._prior_parts
         speed, grade, lateral = (
             sqrt(squares / sums.distance) for squares in (sums.speed_squares, sums.grade_squares, sums.lateral_squares)

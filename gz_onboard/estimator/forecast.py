@@ -1,23 +1,26 @@
 """Range: usable energy at the expected load and temperature over the price of the way ahead, with an interval.
 
 The riding to expect comes from the learner (`consumption`), the energy from the pack's equations (`drawable`,
-`warming`), the interval from the variances of both (`interval`). The displayed range is smoothed here and only here.
+`warming`), the interval from the variances of both. The displayed range is smoothed here and only here. While the pack
+is charged, the forecaster says when it will be full.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import exp, hypot, log, sqrt
-from typing import Any
+from math import ceil, exp, hypot, inf, log, sqrt
+from typing import Any, NamedTuple
 
-from gz_onboard.constants import HOUR
+from gz_onboard.constants import DECILE, HOUR
 from gz_onboard.estimator import consumption
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.consumption import CONSUMPTION, ConsumptionLearner
-from gz_onboard.estimator.interval import DECILE, deciles
-from gz_onboard.estimator.load_model import AHEAD
+from gz_onboard.estimator.load_model import AHEAD, Conditions
+from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.saved_fields import Each, Number
+from gz_onboard.estimator.sources import PackReading
+from gz_onboard.events import Activity, Estimate, Reason
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.drawable import Drawable, cells_ahead, drawable, pack_constants
 from gz_onboard.physics.model import Model
@@ -26,12 +29,18 @@ from gz_onboard.physics.riding import PriorRiding
 
 @dataclass(frozen=True)
 class ForecastConfig:
-    """How ranges are computed and displayed."""
+    """When and how ranges are computed and displayed, and how charges are followed."""
 
+    period_s: float = 1.0  # between forecasts
+    early_s: float = 0.05  # by which one may be made early, rather than a step late
+    longest_s: float = 60.0  # of a pause that energy drawn is counted over
+    soc_step: float = 0.05  # relative: no current changes the state of charge by more from one forecast to the next
     most_sd: float = 1.0  # of the logarithm of the range: beyond, nothing is known of it
-    # Change of SOC, cells [degC], their sd, ambient [degC], logarithm of the power and form factor squared from which a
-    # discharge is computed again: each is worth about 0.05 % of the energy
-    discharge_step: tuple[float, ...] = (0.002, 0.1, 0.2, 0.5, 0.005, 0.02)
+    # Change of SOC, cells [degC], their sd, ambient [degC], logarithm of the power, form factor squared, capacity and
+    # resistance from which a discharge is computed again; until then its energy moves along SOC and temperature. What
+    # that leaves out, or each of the others, is worth about 0.05 % of the energy.
+    discharge_step: tuple[float, ...] = (0.005, 0.5, 0.5, 0.5, 0.005, 0.02, 0.0005, 0.002)
+    cells_stay: float = 0.65  # share of a change of the cells' temperature now that is in their mean on the way
     # Smoothing of the displayed range
     length_m: float = 6000.0  # the errors of forecasts so near to each other are nearly the same error
     near_empty: float = 3.0  # the gap closes over the range over this: the error shrinks as the range does
@@ -44,13 +53,31 @@ class ForecastConfig:
     still_m: float = 0.1  # from one forecast to the next: noise of a speed sensor at standstill
     held: float = 0.05  # of the range: changes of the forecast at standstill that wait for riding
     most_ratio: float = 2.0  # displayed over forecast, or forecast over displayed
+    # Charging
+    charger_cut_off: float = 0.05  # 1/h: current over capacity at which chargers of lithium-ion cells end
+    slice: float = 0.01  # of SOC, over which the charging current counts as constant
+    charger_settling_s: float = 20.0  # current is averaged over it: chargers ripple, and taper off in steps
 
 
 FORECAST = ForecastConfig()
 FIELDS = consumption.FIELDS | {
     "shown": {"gap": Number(-1e6, 1e6), "forecast": Each(Number(0.0, 1e12), 2, optional=True)}  # m; m, J
 }
-"""Of the saved state: what was learned of the riding."""
+"""Of the saved state: the riding as learned."""
+
+
+def deciles(energy: float, down: float, up: float, variance: float) -> tuple[float, float]:
+    """The energies [J] that would go as far as P10 and P90, at the consumption that is expected.
+
+    energy: the median [J]; its sd downwards and upwards [J]; variance: of the logarithm of the consumption. The energy
+    is normal, the consumption log-normal; deciles that each would give alone are added as sds are. So it is right for
+    each alone, at any size, and nothing jumps where the energy becomes less than its own error.
+    """
+    if energy <= 0:
+        return 0.0, DECILE * up
+    spread, least = DECILE * sqrt(variance), 1 - DECILE * down / energy
+    p10 = energy * exp(-hypot(spread, log(least))) if least > 0 else 0.0
+    return p10, energy * exp(hypot(spread, log(1 + DECILE * up / energy)))
 
 
 @dataclass(frozen=True)
@@ -144,7 +171,7 @@ class RangeSmoother:
         return self.shown(raw)
 
     def snapshot(self) -> dict[str, object]:
-        """State to be kept over a restart; without what a route has made of it, as that is not kept."""
+        """State to be kept over a restart; without the effect of a route, which is not kept."""
         if self._on_route or self._before is None:
             return {"gap": 0.0 if self._on_route else self.gap, "forecast": None}
         return {"gap": self.gap, "forecast": list(self._before)}
@@ -155,12 +182,33 @@ class RangeSmoother:
         return cls(saved["gap"], tuple(saved["forecast"]) if saved["forecast"] else None)
 
 
-@dataclass(frozen=True, slots=True)
-class _Discharge:
+def time_to_full(battery: Battery, soc: float, current: float, temperature: float) -> float | None:
+    """Duration [s] of a charge from the cells' `soc`, at the charging `current` [A] now, positive into the pack.
+
+    A charger holds its current until the cells reach the voltage of full ones, and then that voltage, at which the
+    current falls (CC-CV). It ends where the vehicle shows 100 %, or at `charger_cut_off`. None if the current never
+    fills the pack. temperature: of the cells [degC].
+    """
+    if current <= 0:
+        return None
+    full, capacity, width = battery.window.high, battery.pack_capacity(temperature), FORECAST.slice
+    at_full, seconds = battery.ocv(1.0, temperature)[0], 0.0
+    for k in range(int(soc / width), ceil(full / width)):  # the same slices from any SOC: no steps at the end
+        low, high = max(soc, k * width), min((k + 1) * width, full)
+        middle = (low + high) / 2
+        r0, r1, _ = battery.circuit(middle, temperature)
+        most = (at_full - battery.ocv(middle, temperature)[0]) / (r0 + r1) * battery.cells_parallel
+        if most < FORECAST.charger_cut_off * capacity:
+            break
+        seconds += max(high - low, 0.0) * capacity * HOUR / min(current, most)
+    return seconds
+
+
+class _Discharge(NamedTuple):
     """A discharge and the inputs it was computed for, near which it holds."""
 
     inputs: tuple[float, ...]  # see `discharge_step`
-    health: tuple[object, ...]
+    weakest: object  # group of cells
     cells: float  # degC
     left: Drawable
     lost_colder: float  # J less if the cells are colder by their sd
@@ -180,6 +228,13 @@ class Forecaster:
         p = model.parameters
         self._cutoff_sd, self._empty_sd = p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty")  # V
         self._discharge: _Discharge | None = None  # the last one
+        self.latest: Forecast | None = None
+        self._time, self._soc = -inf, 0.0  # of it
+        self._factor = 1.0, 0.0  # consumption factor and its sd, as of it
+        self._charge_power: float | None = None  # W into the pack; None unless charging
+        self._charge_current = 0.0  # A into the pack
+        self._to_full: float | None = None  # s
+        self._full: Forecast | None = None  # while charging
         self._shown_at, self._rides = 0.0, 0  # distance [m] and rides of the learner at the last displayed forecast
 
     def forget(self, distance: float) -> None:
@@ -209,10 +264,13 @@ class Forecaster:
         the consumption.
         """
         learner = self.learner
-        expected = learner.expected(self._rough_way(soc, cell_temperature), ambient, altitude)
+        charge = soc * self.battery.pack_capacity(cell_temperature) * HOUR
+        nominal = charge * self.battery.ocv(HALF_FULL)[0] * self.battery.cells_series  # J
+        way = max(nominal / learner.prior_price, CONSUMPTION.segment_m)  # that it lasts, roughly
+        expected = learner.expected(way, ambient, altitude)
         price = expected.consumption
         load = log(expected.power), expected.form_factor_squared
-        discharge = self._discharged((soc, cell_temperature, temperature_sd, ambient, *load))
+        discharge = self._discharged(soc, cell_temperature, temperature_sd, ambient, *load)
         left = discharge.left
         of_end = (
             (hypot(self.battery.window.sd, left.end_sd) * left.slope) ** 2
@@ -242,32 +300,99 @@ class Forecaster:
             known_from=learner.habits.price.known_from,
         )
 
-    def _discharged(self, inputs: tuple[float, ...]) -> _Discharge:
-        """The discharge from `inputs`, as in `discharge_step`: the last one, moved along SOC, or a new one."""
+    def _discharged(self, *now: float) -> _Discharge:
+        """The discharge from these inputs, as in `discharge_step`: the last one, moved a little, or a new one."""
         health, last = self.battery.health, self._discharge
-        aged = health.capacity, health.resistance, health.weakest
-        if last and last.health == aged and last.left.energy > last.left.slope * FORECAST.discharge_step[0]:
-            moved = zip(inputs, last.inputs, FORECAST.discharge_step, strict=True)
-            if all(abs(x - before) < step for x, before, step in moved):
-                energy = last.left.energy + last.left.slope * (inputs[0] - last.inputs[0])
-                return replace(last, left=replace(last.left, energy=energy))
-        soc, temperature, sd, ambient, log_power, form_factor_squared = inputs
+        inputs = *now, health.capacity, health.resistance
+        if last and last.weakest == health.weakest and last.left.energy > last.left.slope * FORECAST.discharge_step[0]:
+            moved = [x - before for x, before in zip(inputs, last.inputs, strict=True)]
+            if all(abs(x) < step for x, step in zip(moved, FORECAST.discharge_step, strict=True)):
+                energy = last.left.energy + last.left.slope * moved[0]
+                if sd := last.inputs[2]:
+                    energy += FORECAST.cells_stay * last.lost_colder / sd * moved[1]
+                return last._replace(left=replace(last.left, energy=energy))
+        soc, temperature, sd, ambient, log_power, form_factor_squared = now
         load = exp(log_power), form_factor_squared
         cells = cells_ahead(self.battery, self.cooling, (soc, temperature), ambient, load, self._overpotential)
         left, colder = (drawable(self.battery, soc, at, *load, self._overpotential) for at in (cells, cells - sd))
-        self._discharge = _Discharge(inputs, aged, cells, left, left.energy - colder.energy)
+        self._discharge = _Discharge(inputs, health.weakest, cells, left, left.energy - colder.energy)
         return self._discharge
 
-    def _rough_way(self, soc: float, temperature: float) -> float:
-        """Distance that the charge lasts [m], roughly: by the battery's nominal energy and the prior's price."""
-        charge = soc * self.battery.pack_capacity(temperature) * HOUR
-        energy = charge * self.battery.ocv(HALF_FULL)[0] * self.battery.cells_series
-        return max(energy / self.learner.prior_price, CONSUMPTION.segment_m)
+    def step(
+        self,
+        now: float,
+        soc: tuple[float, float],
+        cells: tuple[float, float],
+        conditions: Conditions,
+        loss_variance: float,
+        reading: PackReading,
+        activity: Activity,
+        along: Callable[[Forecast], Forecast],
+    ) -> Forecast:
+        """Make the forecast of `now` [s] and keep it as `latest`; along: makes it one along a route.
+
+        soc, cells: state of charge, and the cells' temperature [degC], each with its sd; loss_variance: see `forecast`.
+        """
+        elapsed, self._time = min(now - self._time, FORECAST.longest_s), now
+        air = conditions.ambient, conditions.altitude
+        free = self.forecast(*soc, *cells, *air, loss_variance)
+        voltage, current, charging = reading.voltage, reading.current, activity is Activity.CHARGING
+        if abs(soc[0] - self._soc) > FORECAST.soc_step * self._soc > 0:
+            self.smoother.show_next()
+        self._soc = soc[0]
+        drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
+        self.latest = self.shown(along(free), drawn)
+        self._factor = self.learner.consumption_factor, sqrt(self.learner.habits.factor.variance)
+        if charging and voltage and current is not None:
+            self._follow_charge(elapsed, soc[0], cells[0], voltage, current)
+            self._full = self.forecast(self.battery.window.high, 0.0, *cells, *air)
+        else:
+            self._charge_power = self._to_full = self._full = None
+        return self.latest
+
+    @property
+    def consumption(self) -> float | None:
+        """Expected consumption [J/m]."""
+        return self.latest.consumption if self.latest else None
+
+    def due(self, now: float) -> bool:
+        """Whether the next forecast is due at `now` [s]."""
+        return now - self._time >= FORECAST.period_s - FORECAST.early_s
+
+    def outdate(self) -> None:
+        """Make the next forecast due at once: the last one's basis no longer holds."""
+        self._time = -inf
+
+    def _follow_charge(self, elapsed: float, soc: float, temperature: float, voltage: float, current: float) -> None:
+        """Follow a charge for `elapsed` [s]; current [A] positive discharging, temperature [degC] of the cells."""
+        share = 1.0 if self._charge_power is None else elapsed / (elapsed + FORECAST.charger_settling_s)
+        self._charge_current += share * (-current - self._charge_current)
+        self._charge_power = max(voltage * self._charge_current, 0.0)
+        # While less flows, as in a pause, the time to full is unknown.
+        flows = -current > MOTION.charging_rate * self.battery.pack_capacity(temperature)
+        self._to_full = time_to_full(self.battery, soc, self._charge_current, temperature) if flows else None
+
+    def report(self, estimate: Estimate) -> None:
+        """Write the latest forecast into `estimate`."""
+        forecast = self.latest
+        if forecast is None:
+            return
+        estimate.range, estimate.range_p10, estimate.range_p90 = forecast.range, forecast.p10, forecast.p90
+        estimate.energy_left, estimate.energy_left_sd = forecast.energy, forecast.energy_sd
+        estimate.consumption_expected = forecast.consumption
+        estimate.consumption_expected_sd = forecast.consumption_sd
+        estimate.consumption_recent = forecast.recent
+        estimate.consumption_factor, estimate.consumption_factor_sd = self._factor
+        if forecast.mostly_prior:
+            estimate.reasons |= Reason.PRIOR_RIDING
+        if estimate.activity is Activity.CHARGING:  # not of a bus that fell silent
+            estimate.charge_power, estimate.time_to_full = self._charge_power, self._to_full
+            estimate.range_full = self.smoother.shown(self._full.range) if self._full else None
 
     def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
         """`forecast` with the range to display; to be asked once for each. drawn: see `RangeSmoother.follow`.
 
-        P10 and P90 are those of the newest forecast, as they must follow what it has just learned. They also enclose
+        P10 and P90 are those of the newest forecast, as they must follow the latest learning. They also enclose
         the displayed range: where that falls towards P10, P10 stays below it.
         """
         learner = self.learner

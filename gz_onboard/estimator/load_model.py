@@ -3,7 +3,7 @@
 Effects of a vehicle file may read more than speed, acceleration and grade. For the riding so far they get heading,
 lateral acceleration, vibration and time moving as measured. For the riding to come
 
-- the heading is unknown: the mean over all headings, so that a steady wind costs what it costs on a round trip;
+- the heading is unknown: the mean over all headings, so that a steady wind costs as much as on a round trip;
 - lateral acceleration and vibration are those of the same riding, or the prior's before anything is ridden;
 - the time moving is half an hour more, as a range lasts an hour or so: tyres are warm then;
 - effects with memory are settled. Those in the cells take their voltage at the mean current.
@@ -24,7 +24,6 @@ from gz_onboard.physics.model import Model, Recall, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
 
 if TYPE_CHECKING:
-    from gz_onboard.estimator.consumption import ConsumptionLearner
     from gz_onboard.estimator.motion import Motion, VibrationMonitor
     from gz_onboard.estimator.signals import Signals
     from gz_onboard.estimator.soc import StateOfCharge
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 Quantities = dict[str, float]
 """Inputs of effects by name: see `physics.effect.QUANTITIES`."""
-AHEAD = 1800.0  # s: half of what a range lasts
+AHEAD = 1800.0  # s: half of the time that a range lasts
 WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
 # rad: for a wind slower than the vehicle their mean equals that of all headings
 HEADINGS = tuple(pi / 4 * i for i in range(8))
@@ -81,7 +80,8 @@ class LoadModel:
     """Forward model of one vehicle with the inputs that are typical for it.
 
     extended: the road load reads more than `BASE`; ledger: kept of the riding if there is one, which on board there is
-    not; states: of effects with memory between road and pack.
+    not; states: of effects with memory between road and pack; time_moving: since the start or the last
+    long standstill [s].
     """
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
@@ -89,6 +89,7 @@ class LoadModel:
         self.prior = prior
         self.ledger: Ledger | None = None
         self.states: dict[str, float] = {}
+        self.time_moving = 0.0
         road = [effect for effect in model.effects if effect.port is not Port.CELL_VOLTAGE]
         reads = frozenset[str]().union(*(effect.reads for effect in road))
         memory = any(effect.decay for effect in road)
@@ -178,7 +179,7 @@ class PresentLoad:
 
     def __init__(
         self,
-        learner: ConsumptionLearner,
+        load: LoadModel,
         motion: Motion,
         temperatures: Temperatures,
         soc: StateOfCharge,
@@ -186,7 +187,7 @@ class PresentLoad:
         signals: Signals,
     ) -> None:
         """monitor: for a model that reads the vibration."""
-        self._learner, self._load, self._motion, self._temperatures = learner, learner.load, motion, temperatures
+        self._load, self._motion, self._temperatures = load, motion, temperatures
         self._soc, self._monitor, self._motor_temperature = soc, monitor, signals.motor_temperature
 
     def conditions(self, now: float) -> Conditions:
@@ -215,8 +216,8 @@ class PresentLoad:
 
     def power_at(self, now: float, speed: float, acceleration: float, grade: float = 0.0) -> float:
         """Power that the pack would give [W] at this speed [m/s], acceleration [m/s²] and grade (sine)."""
-        moving = self._learner.time_moving
-        return self._load.power(self._load.quantities(speed, acceleration, self.conditions(now), grade, moving))
+        load = self._load
+        return load.power(load.quantities(speed, acceleration, self.conditions(now), grade, load.time_moving))
 
     def power_of_prior(self, now: float) -> float:
         """Power of the riding before the first voltage [W]: the prior's, or, where it rides faster, at its speed."""
@@ -226,7 +227,7 @@ class PresentLoad:
 
     def cell_inputs(self, now: float) -> dict[str, float]:
         """Inputs of effects in the cells, apart from those of the cells themselves."""
-        inputs = {"time_moving": self._learner.time_moving}
+        inputs = {"time_moving": self._load.time_moving}
         return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
 
     def vibration(self, now: float) -> float:

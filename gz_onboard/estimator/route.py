@@ -7,19 +7,25 @@ of the route is ridden the correction is the consumption factor of the riding in
 
 The range is the distance along the route that the energy left goes, and beyond its end at the consumption expected
 without a route.
+
+With a receiver and a route that has positions it is followed by both: the distance ridden says where the vehicle should
+be by now, and the nearest place of the route around there corrects that. So roads that the route takes twice, loops and
+turning back do not make it jump. After some way off the route, or against its direction, the vehicle has left it. Then
+all of the route is searched for the place that it is at, in the route's direction; of several, the one nearest to where
+the distance ridden since would have led. Without either, it is where the distance ridden since the route was given
+says.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import inf, sqrt
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from math import cos, exp, inf, pi, radians, sqrt
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gz_onboard.estimator.forecast import Forecast, Forecaster
-from gz_onboard.estimator.interval import DECILE, deciles
+from gz_onboard.constants import DECILE, METRES_PER_DEGREE
+from gz_onboard.estimator.forecast import Forecast, Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions, LoadModel
 from gz_onboard.estimator.motion import Motion
-from gz_onboard.estimator.route_position import HeightCheck, RoutePosition
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import Estimate, RouteState
 from gz_onboard.physics.drawable import soc_left
@@ -34,14 +40,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """Constants of the forecast along a route."""
+    """How a route is followed and its cost is learned."""
 
+    # Position; m unless stated
+    off: float = 50.0  # from the route: a receiver in a town and a map are off by 20 m together
+    leaving: float = 60.0  # ridden off the route before that is believed: receivers err for seconds
+    joining: float = 30.0  # from the route, to be taken as on it again
+    staying: float = 40.0  # ridden on it before that is believed
+    staying_far: float = 300.0  # the same, where it would be a leap along the route
+    leap: float = 500.0  # along the route, besides the distance ridden off it
+    around: float = 130.0  # to both sides of where it should be: 80, and 5 % of a tunnel of 1 km
+    longitudinal: float = 5.0  # a metre along the route counts so much less than one across
+    gain: float = 0.3  # share of the difference along the route that one fix corrects
+    against: float = 2.0  # rad between the course and the route's heading: ridden the other way
+    compared: float = 1500.0  # over which heights are compared: a receiver's altitude drifts by some metres on it
+    min_compared: float = 700.0  # of that, before which nothing is said
+    heights_apart: float = 0.02  # of the way: differing by more they are of two roads
+    heights_alike: float = 0.01  # by less of one again
+    step: float = 100.0  # longer ones, or farther from the distance ridden: along the route it was placed elsewhere
+
+    # Cost
     segment_m: float = 250.0  # of the route from which the cost is learned
     segment_sd: float = 0.25  # relative, of a segment's measured over modelled energy; recorded full discharges
     cost_walk_sd: float = 0.003  # of the change of the cost over a segment: wind, traffic
     initial_sd: float = 0.1  # relative, of the cost over the consumption factor; eight commissioning rides
-    cost_limits: tuple[float, float] = (0.2, 5.0)  # beyond, the route is not what is ridden
-    ahead_sd: float = 0.015  # relative, of the cost of what is left, beyond what its segments scatter
+    cost_limits: tuple[float, float] = (0.2, 5.0)  # beyond, another road is ridden
+    ahead_sd: float = 0.015  # relative, of the cost of the rest, beyond the scatter of its segments
     detour_share: float = 0.1  # of a segment: ridden so much more or less, it teaches nothing
     evened_share: float = 0.6  # of the differences in cost along the route; slow roads have stops that no map shows
     min_course_speed: float = 3.0  # m/s: slower, the heading is noise
@@ -52,8 +76,123 @@ class RouteConfig:
 CONFIG = RouteConfig()
 
 
-@dataclass(frozen=True)
-class RouteCosts:
+class RoutePosition:
+    """Follows the vehicle along a route. `along`: how far along it is [m], while it is `on` it."""
+
+    def __init__(self, route: Route) -> None:
+        """Import numpy."""
+        import numpy as np
+
+        self._np, self.along, self.on = np, 0.0, True
+        self._placed = False  # a fix has been seen
+        self._away = 0.0  # m ridden off the route, or against it
+        self._candidate: float | None = None  # m: where it may be on the route again
+        self._stayed = 0.0  # m ridden there
+        self._distance = np.array(route.distance)
+        self._latitude = np.array(route.latitude)
+        self._longitude = np.unwrap(np.array(route.longitude), period=360.0)
+
+    def at(self, along: float) -> tuple[float | None, float | None]:
+        """Latitude and longitude [deg] at a distance along the route [m]; None if the route has no positions."""
+        if not len(self._latitude):
+            return None, None
+        interp = self._np.interp
+        longitude = float(interp(along, self._distance, self._longitude))
+        return float(interp(along, self._distance, self._latitude)), (longitude + 180.0) % 360.0 - 180.0
+
+    def update(self, moved: float, fix: tuple[float, float] | None, course: float | None) -> None:
+        """Move by `moved` [m]; fix: latitude and longitude [deg], if known; course [rad], if it is moving."""
+        self.along += moved
+        if fix is None or not len(self._latitude):
+            self._away += 0.0 if self.on else moved
+        elif self.on and self._placed:
+            self._follow(moved, fix, course)
+        else:
+            self._search(moved, fix, course)
+        if self.on and self.along >= self._distance[-1]:
+            self.along, self.on = float(self._distance[-1]), False
+
+    def _follow(self, moved: float, fix: tuple[float, float], course: float | None) -> None:
+        config = CONFIG
+        along, off, turned = self._places(fix, course, config.around)
+        on = False
+        if len(along):
+            best = (off**2 + ((along - self.along) / config.longitudinal) ** 2).argmin()
+            if off[best] < config.off:
+                self.along += config.gain * float(along[best] - self.along)
+                on = bool(turned[best] < config.against)
+        self._away = 0.0 if on else self._away + moved
+        if self._away > config.leaving:
+            self.on, self._candidate = False, None
+
+    def _search(self, moved: float, fix: tuple[float, float], course: float | None) -> None:
+        """Look for the vehicle on all of the route."""
+        config, first = CONFIG, not self._placed
+        self._away, self._placed, self.on = self._away + moved, True, False
+        along, off, turned = self._places(fix, course, inf)
+        along = along[(off < config.joining) & (turned < pi / 2)]
+        if not len(along):
+            self._candidate = None
+            return
+        expected = self.along if self._candidate is None else self._candidate + moved
+        place = float(along[abs(along - expected).argmin()])
+        stays = self._candidate is not None and abs(place - expected) <= config.around
+        self._candidate, self._stayed = place, self._stayed + moved if stays else 0.0
+        far = abs(place - self.along)
+        if (first and far < config.around) or self._stayed >= (
+            config.staying_far if far > config.leap + self._away else config.staying
+        ):
+            self.along, self.on, self._away = place, True, 0.0
+
+    def _places(self, fix: tuple[float, float], course: float | None, around: float) -> tuple[Array, Array, Array]:
+        """Of each piece of the route within `around` [m]: the place nearest to `fix`.
+
+        Gives its distance along the route [m], how far it is from the fix [m], and the angle [rad] between the course
+        and the route there, 0 without a course.
+        """
+        np = self._np
+        low, high = np.searchsorted(self._distance, (self.along - around, self.along + around))
+        some = slice(max(int(low) - 1, 0), int(high) + 1)
+        x = (self._longitude[some] - fix[1] + 180.0) % 360.0 - 180.0
+        x, y = x * METRES_PER_DEGREE * cos(radians(fix[0])), (self._latitude[some] - fix[0]) * METRES_PER_DEGREE
+        dx, dy, length = np.diff(x), np.diff(y), np.diff(self._distance[some])
+        share = np.clip(-(x[:-1] * dx + y[:-1] * dy) / (dx**2 + dy**2), 0.0, 1.0)
+        off = np.hypot(x[:-1] + share * dx, y[:-1] + share * dy)
+        turned = 0.0 * off if course is None else np.abs((course - np.arctan2(dx, dy) + pi) % (2 * pi) - pi)
+        return self._distance[some][:-1] + share * length, off, turned
+
+
+class HeightCheck:
+    """Whether the hills of a route are those ridden: a file of another road, or in feet, has others.
+
+    Compares the height that the route gains with that which the vehicle gains on it, over the latest kilometre or so.
+    """
+
+    def __init__(self) -> None:
+        self.contradicts = False
+        self._before: tuple[float, float] | None = None  # m along the route, m of altitude
+        self._way = self._apart = 0.0  # m, fading
+
+    def update(self, along: float, ridden: float, climb: float, altitude: float | None) -> None:
+        """The vehicle is at `along` [m] of the route, `ridden` [m] since the last update.
+
+        climb: that the route gains between the two [m]; altitude: measured [m], None if it is not known.
+        """
+        config, before = CONFIG, self._before
+        self._before = None if altitude is None else (along, altitude)
+        if before is None or altitude is None:
+            return
+        way, gained = along - before[0], altitude - before[1]
+        if not 0 < way < config.step or abs(way - ridden) > config.step or abs(gained) > way:
+            return
+        kept = exp(-way / config.compared)
+        self._way, self._apart = kept * self._way + way, kept * self._apart + climb - gained
+        if self._way > config.min_compared:
+            limit = config.heights_alike if self.contradicts else config.heights_apart
+            self.contradicts = abs(self._apart) > limit * self._way
+
+
+class RouteCosts(NamedTuple):
     """Modelled energies from the start of the route to each of its points [J], shape (n,)."""
 
     level: Array
@@ -79,16 +218,12 @@ class PreparedRoute:
         known = {"grade": route.grade, "curvature": route.curvature, "heading": route.heading}
         known |= {"headwind": route.headwind or (0.0,) * len(route.distance)}
         self._pieces = {name: np.interp(middles, route.distance, values) for name, values in known.items()}
+        self.length = float(self.distance[-1])  # m
         self.climb = np.concatenate(([0.0], np.cumsum(self._pieces["grade"] * np.diff(self.distance))))
         self._stops = np.zeros(len(middles))  # s
         if route.stop:
             ends = np.searchsorted(self.distance, np.array(route.distance))
             np.add.at(self._stops, np.minimum(ends, len(middles) - 1), np.array(route.stop))
-
-    @property
-    def length(self) -> float:
-        """Length of the route [m]."""
-        return float(self.distance[-1])
 
     def between(self, values: Array, start: float, end: float) -> float:
         """How much of the running total `values` (n,) lies between two distances [m]."""
@@ -101,15 +236,14 @@ class PreparedRoute:
         if energy <= 0:
             return 0.0
         first = int(np.searchsorted(self.distance, start, side="right"))
-        here = np.interp(start, self.distance, total)
         way = np.concatenate(([start], self.distance[first:]))
-        used = np.concatenate(([0.0], total[first:] - here))
+        used = np.concatenate(([0.0], total[first:] - np.interp(start, self.distance, total)))
         beyond = np.flatnonzero(used >= energy)
         if not len(beyond):
             return None
         i = beyond[0]
         share = (energy - used[i - 1]) / (used[i] - used[i - 1])
-        return float(way[i - 1] + share * (way[i] - way[i - 1]) - start)
+        return float(way[i - 1] + share * (way[i] - way[i - 1])) - start
 
     def costs(self, load: LoadModel, air: Conditions, time_moving: float) -> RouteCosts:
         """Model the whole route in this `air`; time_moving: of the ride so far [s]. About 1 ms for each 10 km."""
@@ -145,36 +279,21 @@ class PreparedRoute:
         return power
 
 
-@dataclass(frozen=True, slots=True)
-class RouteOutlook:
-    """Forecast of the way ahead, by the names of `Estimate`; SI units. None: not known, or not on the route."""
-
-    route_state: RouteState = RouteState.NONE
-    route_along: float | None = None
-    route_left: float | None = None
-    route_energy: float | None = None  # to the end of the route
-    route_energy_sd: float | None = None
-    arrival_soc: float | None = None  # 0 if the battery ends before
-    arrival_soc_p10: float | None = None
-    arrival_soc_p90: float | None = None
-    battery_ends_after: float | None = None
-    battery_ends_latitude: float | None = None
-    battery_ends_longitude: float | None = None
-
-
-_NAMES = tuple(RouteOutlook.__dataclass_fields__)
+REPORTED = tuple(f.name for f in fields(Estimate) if f.name.startswith(("route_", "arrival_", "battery_ends_")))
+"""Fields of an estimate about the route: the position on it and the way ahead."""
 
 
 class RouteForecaster:
     """Follows the vehicle along a route and forecasts on it. Without a route it costs nothing.
 
-    `cost`: measured over modelled energy of the level road, with `variance`. `hills`: the energy [J] that heights take
-    on the part [m] of the range that lies on the route.
+    `outlook`: an estimate of which only the fields `REPORTED` count. `cost`: measured over modelled energy of the level
+    road, with `variance`. `hills`: the energy [J] that heights take on the part [m] of the range that lies on
+    the route.
     """
 
     def __init__(self, forecaster: Forecaster, motion: Motion, signals: Signals) -> None:
         model = forecaster.load.model
-        self.outlook, self.hills, self.cost, self.variance = RouteOutlook(), (0.0, 0.0), 1.0, 0.0
+        self.outlook, self.hills, self.cost, self.variance = Estimate(0.0), (0.0, 0.0), 1.0, 0.0
         self.costs: RouteCosts | None = None
         self._forecaster, self._motion, self._signals = forecaster, motion, signals
         self._moving_mass = model.mass + rotating_mass(model.parameters)
@@ -193,7 +312,7 @@ class RouteForecaster:
         self._route, self.costs, self._segment = route, None, None
         self._distance, self._heights = self._motion.distance, HeightCheck()
         self._forecaster.smoother.show_next()
-        self.outlook = RouteOutlook(RouteState.OFF if route else RouteState.NONE)
+        self.outlook = Estimate(0.0, route_state=RouteState.OFF if route else RouteState.NONE)
         self.hills = 0.0, 0.0
 
     def ride(self, dt: float, speed: float, power: float) -> None:
@@ -215,10 +334,10 @@ class RouteForecaster:
             return free
         self._move(now, route)
         on = route.position.on and not self._heights.contradicts
-        if on is not (self.outlook.route_state is RouteState.ON):  # what is shown now stands on something else
+        if on is not (self.outlook.route_state is RouteState.ON):  # the display has another basis now
             self._forecaster.smoother.show_next(on_route=on)
         if not on:
-            self._segment, self.outlook, self.hills = None, RouteOutlook(RouteState.OFF), (0.0, 0.0)
+            self._segment, self.outlook, self.hills = None, Estimate(0.0, route_state=RouteState.OFF), (0.0, 0.0)
             return free
         costs, config = self.costs, CONFIG
         if (
@@ -230,14 +349,14 @@ class RouteForecaster:
                 learner = self._forecaster.learner
                 self.cost = learner.factor
                 self.variance = learner.habits.factor.variance + (config.initial_sd * learner.factor) ** 2
-            self.costs = costs = route.costs(self._forecaster.load, air, self._forecaster.learner.time_moving)
+            self.costs = costs = route.costs(self._forecaster.load, air, self._forecaster.load.time_moving)
         self._learn(route, costs)
         return self._ahead(route, costs, free, soc, loss_variance)
 
     def report(self, estimate: Estimate) -> None:
         """Write the outlook into `estimate`."""
         if self._route:
-            for name in _NAMES:
+            for name in REPORTED:
                 setattr(estimate, name, getattr(self.outlook, name))
 
     def _move(self, now: float, route: PreparedRoute) -> None:
@@ -301,9 +420,22 @@ class RouteForecaster:
         low, high = deciles(free.energy, free.energy_sd, free.energy_sd_up, spread**2)
         needed_sd = level * relative_sd(left)
         ends = range_ if range_ < left else None
-        ends_at = (None, None) if ends is None else route.position.at(here + ends)
-        arrival = self._arrival(free, soc, needed, needed_sd)
-        self.outlook = RouteOutlook(RouteState.ON, here, left, needed, needed_sd, *arrival, ends, *ends_at)
+        latitude, longitude = (None, None) if ends is None else route.position.at(here + ends)
+        arrival, arrival_p10, arrival_p90 = self._arrival(free, soc, needed, needed_sd)
+        self.outlook = Estimate(
+            0.0,
+            route_state=RouteState.ON,
+            route_along=here,
+            route_left=left,
+            route_energy=needed,
+            route_energy_sd=needed_sd,
+            arrival_soc=arrival,
+            arrival_soc_p10=arrival_p10,
+            arrival_soc_p90=arrival_p90,
+            battery_ends_after=ends,
+            battery_ends_latitude=latitude,
+            battery_ends_longitude=longitude,
+        )
         self.hills = route.between(costs.height, here, here + within), within
         expected = free.energy / range_ if range_ > 0 and free.energy > 0 else free.consumption
         known_from = config.segment_m * config.segment_sd**2 / self.variance  # riding that would tell as much

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import ceil, cos, floor, hypot, isfinite, log10, radians
 
-from gz_onboard.estimator.route_position import METRES_PER_DEGREE
+from gz_onboard.constants import METRES_PER_DEGREE
 
 GRAIN = 1000  # columns and lines of a picture: a screen shows no more
 TICKS = 5  # on an axis, about

@@ -291,7 +291,7 @@ def test_the_time_moving_outlives_a_restart():
     f = ride(forecaster(vehicle), vehicle.model, 2)
     again = forecaster(vehicle)
     again.restore(json.loads(json.dumps(f.snapshot())))
-    assert again.learner.time_moving == f.learner.time_moving > 150
+    assert again.load.time_moving == f.load.time_moving > 150
 
 
 def test_memory_between_road_and_pack_steps_each_second(tmp_path):

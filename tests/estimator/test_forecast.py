@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from math import exp
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from gz_onboard.constants import DECILE
 from gz_onboard.estimator import forecast as forecast_module
-from gz_onboard.estimator.consumption import ExpectedRiding
-from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.saved_fields import check
 from gz_onboard.offline.cooling import LumpedCooling
@@ -229,6 +232,15 @@ def test_a_damaged_snapshot_is_refused(damage):
         check(declared, {**f.snapshot(), **damage})
 
 
+def test_a_saved_price_below_zero_is_refused():
+    f = forecaster()
+    saved = json.loads(json.dumps(f.snapshot()))
+    saved["state"]["habits"]["price"]["level"] = -1.0
+    check(forecast_module.FIELDS, saved)
+    with pytest.raises(ValueError, match="implausible habits"):
+        forecaster().restore(saved)
+
+
 def test_coverage_of_the_interval():
     """An 80 % interval holds about 80 % of the time: riders, winds and traffic drawn at random, of another code.
 
@@ -393,16 +405,16 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effect
     """Against small steps: each loses what its temperature makes it lose, the air takes its share."""
     lost = VEHICLE.model.overpotential(VEHICLE.pack, {"vibration": 0.0, "time_moving": 3600.0}) if effects else None
     cooling = LumpedCooling(VEHICLE.model.parameters, "pack", start)
-    expected = ExpectedRiding(95.0, 800.0, 2.5, 0.01, 20.0)
+    power, load = 800.0, (800.0, 2.5)
     pack, charge, temperatures = VEHICLE.pack, 0.8, []
     while charge > 0:
-        current = pack.settled_current(expected.power, 0.4, cooling.temperature, 2.5, lost)
+        current = pack.settled_current(power, 0.4, cooling.temperature, 2.5, lost)
         assert current is not None
-        loss = pack.cells_series * pack.ocv(0.4, cooling.temperature)[0] * current - expected.power
+        loss = pack.cells_series * pack.ocv(0.4, cooling.temperature)[0] * current - power
         temperatures.append(cooling.temperature)
         cooling.step(20.0, loss + pack.reversible_heat(current, charge, cooling.temperature), ambient)
         charge -= 20.0 * current / 3600 / pack.pack_capacity(cooling.temperature)
-    found = cells_ahead(pack, pack_constants(VEHICLE.model.parameters), (0.8, start), ambient, expected.load, lost)
+    found = cells_ahead(pack, pack_constants(VEHICLE.model.parameters), (0.8, start), ambient, load, lost)
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
 
 
@@ -437,11 +449,11 @@ def test_a_vehicle_file_that_was_calibrated_anew_changes_nothing_of_what_was_rid
 
 def test_tyres_are_cold_again_after_an_hour():
     f = forecaster()
-    f.learner.time_moving = 900.0
+    f.load.time_moving = 900.0
     f.learner.pause(1800.0)
-    assert f.learner.time_moving == 900.0
+    assert f.load.time_moving == 900.0
     f.learner.pause(1800.0)
-    assert f.learner.time_moving == 0.0
+    assert f.load.time_moving == 0.0
 
 
 def test_a_forecast_each_second_equals_one_from_nothing(monkeypatch):
@@ -466,3 +478,22 @@ def test_a_forecast_each_second_equals_one_from_nothing(monkeypatch):
 def test_a_consumption_of_which_nothing_is_known_has_a_finite_interval():
     result = forecaster().forecast(0.7, 0.0, 25.0, 0.0, 20.0, 0.0, loss_variance=25.0)
     assert np.log(result.range / result.p10) == pytest.approx(1.28, rel=0.05)
+
+
+# --- P10 and P90 of energy and consumption together
+
+
+def test_each_alone_is_its_own_distribution():
+    assert deciles(4e6, 3e5, 2e5, 0.0) == pytest.approx((4e6 - DECILE * 3e5, 4e6 + DECILE * 2e5))
+    assert deciles(4e6, 0.0, 0.0, 0.01) == pytest.approx((4e6 * exp(-DECILE * 0.1), 4e6 * exp(DECILE * 0.1)))
+    assert deciles(0.0, 3e5, 2e5, 0.01) == deciles(-1e4, 3e5, 2e5, 0.01) == (0.0, DECILE * 2e5)
+
+
+@given(st.floats(1.0, 1e7), st.floats(1e3, 1e6), st.floats(1e3, 1e6), st.floats(0, 1))
+def test_nothing_jumps_as_the_battery_empties(energy, down, up, variance):
+    """A thousandth less energy moves both by little, of what is left or of its error; and P10 <= energy <= P90."""
+    p10, p90 = deciles(energy, down, up, variance)
+    assert p10 <= energy <= p90
+    less = deciles(0.999 * energy, down, up, variance)
+    assert p10 - less[0] == pytest.approx(0, abs=0.02 * (energy + down))
+    assert p90 - less[1] == pytest.approx(0, abs=0.01 * p90)

@@ -23,7 +23,7 @@ def rides(f: Forecaster, price: float, km: int = 40) -> None:
     """At `price` times what the model says of the prior riding, and a rest after it."""
     learner, habits = f.learner, f.learner.habits
     for _ in range(int(km * 1000 / CONSUMPTION.segment_m)):
-        habits = replace(habits, price=habits.price.learned(price - habits.price.now, CONSUMPTION.segment_m))
+        habits = habits._replace(price=habits.price.learned(price - habits.price.now, CONSUMPTION.segment_m))
     sums = Segment(distance=CONSUMPTION.segment_m, duration=20.0)
     learner.state = replace(learner.state, habits=habits, sums=sums)
 

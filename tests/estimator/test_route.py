@@ -14,8 +14,7 @@ from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
-from gz_onboard.estimator.route import PreparedRoute, RouteForecaster
-from gz_onboard.estimator.route_position import HeightCheck
+from gz_onboard.estimator.route import HeightCheck, PreparedRoute, RouteForecaster
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
 from gz_onboard.physics.drawable import Drawable, drawable, soc_left
 from gz_onboard.routes.route import Route

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from gz_onboard.estimator.route_position import CONFIG, RoutePosition
+from gz_onboard.estimator.route import CONFIG, RoutePosition
 from gz_onboard.routes.route import Route
 
 NORTH, EAST = 111_200.0, 111_200.0 * math.cos(math.radians(40.3))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.estimator import outlook
+from gz_onboard.estimator import forecast
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.weakest import CHARGE, CONFIG, NAMES, VoltageBlock, WeakestGroup
 from gz_onboard.events import Cause, Group
@@ -85,7 +85,7 @@ def ridden(kind: Hidden, until: float, lie: Lie | None = None, saved: dict[str, 
         estimator.restore(json.loads(json.dumps(saved)), "key", None)
     pack = packs()[kind]
     end = pack.time[int(np.argmax(pack.soc <= until))]
-    with patch.object(outlook, "OUTLOOK", outlook.OutlookConfig(period_s=SELDOM)):
+    with patch.object(forecast, "FORECAST", forecast.ForecastConfig(period_s=SELDOM)):
         for event in heard(kind, lie):
             if event[0] > end:
                 break

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from cantools.database.can import Database
 
+from gz_onboard.constants import DECILE
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.interval import DECILE
 from gz_onboard.events import WINDOW, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
