@@ -28,12 +28,8 @@ GOODBYE_S = 2.0  # for the last message
 PORT, TLS_PORT = 1883, 8883
 USER, PASSWORD = "GZ_ONBOARD_MQTT_USER", "GZ_ONBOARD_MQTT_PASSWORD"
 
-Message = tuple[str, bytes]
-Login = tuple[str | None, str | None]
-"""User and password, or neither."""
 
-
-def read_login(file: Path | None, environ: Mapping[str, str] = os.environ) -> Login:
+def read_login(file: Path | None, environ: Mapping[str, str] = os.environ) -> tuple[str | None, str | None]:
     """Read user and password from `file`, or else from `environ`; neither from an empty file.
 
     InputError if others than the owner may read the file, and for a password without a user.
@@ -61,12 +57,12 @@ class Broker:
         self,
         address: str,
         name: str,
-        hello: Message,
-        will: Message,
+        hello: tuple[str, bytes],
+        will: tuple[str, bytes],
         report: Callable[[str], None],
         *,
         tls: str | None = None,
-        login: Login = (None, None),
+        login: tuple[str | None, str | None] = (None, None),
     ) -> None:
         self.address = host_and_port(address, PORT if tls is None else TLS_PORT)
         self.connected = False

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from gz_onboard.constants import WH
 from gz_onboard.dashboard.command import add_source, live, report, view_of
-from gz_onboard.dashboard.vehicle_frames import POSITION_ROLES
 from gz_onboard.dashboard.view import Picture, encoded, value_at
 from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import RouteState
@@ -23,7 +22,6 @@ from gz_onboard.log_rows import (
     location_row,
 )
 from gz_onboard.options import host_and_port
-from gz_onboard.vehicle import read_vehicle
 
 LISTEN = "127.0.0.1:8765"
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -68,15 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
     say, context = partial(report, "foxglove"), foxglove.Context()
     host, port = host_and_port(arguments.listen)
     estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
-    places = None
-    if arguments.vehicle:
-        vehicle = read_vehicle(arguments.vehicle)
-        mapped = {source.role for source in vehicle.mapping.sources}
-        if missing := [role for role in POSITION_ROLES[:2] if role not in mapped]:
-            say(f"{vehicle.file}: [roles] has no {' and no '.join(missing)}: no position is shown")
-        else:
-            places = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context)
-    view = view_of(arguments, positions=places is not None)
+    view = view_of(arguments, positions=bool(arguments.vehicle))
+    if view.has_positions:
+        places = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context)
+    elif arguments.vehicle:
+        say(f"{arguments.vehicle}: [roles] must have latitude and longitude: no position is shown")
     with live(view, arguments) as pictures:
         source = f"{arguments.channel} ({arguments.interface})"
         try:
@@ -89,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         shown_ns = 0
         for picture in pictures:
             estimates.log(encoded(estimate_of(picture)), log_time=time.time_ns())
-            if places and (here := picture["position"]) and here["time_ns"] != shown_ns:
+            if view.has_positions and (here := picture["position"]) and here["time_ns"] != shown_ns:
                 shown_ns = here["time_ns"]
                 places.log(encoded(location_row(frame="gps", **here)), log_time=time.time_ns())
         server.stop()

@@ -31,25 +31,19 @@ PREFIX = "homeassistant"  # where it looks for discovery messages, unless it is 
 NONE = "none"  # alert and reasons when all is well
 
 # Attributes of a sensor, as Home Assistant's MQTT discovery names them.
-_Attributes = dict[str, Any]
-_NUMBER: _Attributes = {"state_class": "measurement", "suggested_display_precision": 0}
+_NUMBER: dict[str, Any] = {"state_class": "measurement", "suggested_display_precision": 0}
 _KM = _NUMBER | {"device_class": "distance", "unit_of_measurement": "km", "suggested_display_precision": 1}
 _CELL = _NUMBER | {"device_class": "temperature", "unit_of_measurement": "°C"}
 _CHARGE = _NUMBER | {"device_class": "battery", "unit_of_measurement": "%"}
 _CONSUMPTION = _NUMBER | {"device_class": "energy_distance", "unit_of_measurement": "Wh/km"}
-_ENUM = {"device_class": "enum"}
-_DIAGNOSTIC = {"entity_category": "diagnostic"}
-_SIGMA = {"unit_of_measurement": "%", "suggested_display_precision": 1}
+_SIGMA = _NUMBER | {"unit_of_measurement": "%", "suggested_display_precision": 1, "entity_category": "diagnostic"}
 
-SENSORS: dict[str, tuple[str, _Attributes]] = {
+SENSORS: dict[str, tuple[str, dict[str, Any]]] = {
     "range": ("range.km", _KM | {"name": "Range"}),
     "range_p10": ("range.p10_km", _KM | {"name": "Range, surely (P10)"}),
     "range_p90": ("range.p90_km", _KM | {"name": "Range, at best (P90)"}),
     "state_of_charge": ("battery.soc_percent", _CHARGE | {"name": "State of charge"}),
-    "state_of_charge_sigma": (
-        "battery.soc_sigma_percent",
-        _NUMBER | _SIGMA | _DIAGNOSTIC | {"name": "State of charge, sigma"},
-    ),
+    "state_of_charge_sigma": ("battery.soc_sigma_percent", _SIGMA | {"name": "State of charge, sigma"}),
     "energy_left": (
         "battery.energy_left_wh",
         _NUMBER | {"name": "Energy left", "device_class": "energy_storage", "unit_of_measurement": "Wh"},
@@ -80,10 +74,16 @@ SENSORS: dict[str, tuple[str, _Attributes]] = {
     ),
     "cell_temperature_coldest": ("cells.coldest_degc", _CELL | {"name": "Coldest cell"}),
     "cell_temperature_hottest": ("cells.hottest_degc", _CELL | {"name": "Hottest cell"}),
-    "activity": ("activity", _ENUM | {"name": "Activity", "options": [a.name.lower() for a in Activity]}),
-    "state": ("state", _ENUM | {"name": "State of the estimate", "options": [s.name.lower() for s in State]}),
-    "alert": ("alerts", _ENUM | {"name": "Alert", "options": [NONE, *ALERTS]}),
-    "reasons": ("reasons", _DIAGNOSTIC | {"name": "Reasons"}),
+    "activity": (
+        "activity",
+        {"device_class": "enum", "name": "Activity", "options": [a.name.lower() for a in Activity]},
+    ),
+    "state": (
+        "state",
+        {"device_class": "enum", "name": "State of the estimate", "options": [s.name.lower() for s in State]},
+    ),
+    "alert": ("alerts", {"name": "Alert", "device_class": "enum", "options": [NONE, *ALERTS]}),
+    "reasons": ("reasons", {"name": "Reasons", "entity_category": "diagnostic"}),
 }
 """By their names in the state: the place in a picture, and the attributes."""
 
@@ -108,8 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     name = arguments.name or re.sub(r"[^\w-]+", "-", socket.gethostname(), flags=re.ASCII) or "scooter"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
         raise InputError(f"--name {name}: must be of letters, digits, - and _, at most 64")
-    topic, login = topic_of(name), read_login(arguments.login)
-    hello = f"{PREFIX}/device/gz-onboard-{name}/config", encoded(discovery(name))
+    topic, login = f"gz-onboard/{name}/state", read_login(arguments.login)
+    hello = f"{PREFIX}/device/gz-onboard-{name}/config", encoded(discovery(name, topic))
     will = topic, encoded({"status": "offline"} | dict.fromkeys(SENSORS))
     broker = Broker(arguments.broker, name, hello, will, partial(report, "mqtt"), tls=arguments.tls, login=login)
     sent, sent_at = None, -math.inf
@@ -127,11 +127,6 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def topic_of(name: str) -> str:
-    """Topic of the state of the vehicle `name`."""
-    return f"gz-onboard/{name}/state"
-
-
 def state_of(picture: Picture) -> dict[str, Any]:
     """Return the values of a picture by name; None if stale, not available or never received."""
     state = {key: value_at(picture, path) for key, (path, _) in SENSORS.items()}
@@ -142,12 +137,12 @@ def state_of(picture: Picture) -> dict[str, Any]:
     return {"status": "online"} | state
 
 
-def discovery(name: str) -> dict[str, Any]:
-    """Return the discovery message for the vehicle `name`: one device with its sensors.
+def discovery(name: str, topic: str) -> dict[str, Any]:
+    """Return the discovery message for the vehicle `name` with its state at `topic`: one device with its sensors.
 
     A sensor is available only while the bridge is online and the value is known.
     """
-    topic, components = topic_of(name), {}
+    components = {}
     for key, (_, attributes) in SENSORS.items():
         there = f"value_json.status == 'online' and value_json.{key} is not none"
         components[key] = attributes | {

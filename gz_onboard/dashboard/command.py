@@ -112,7 +112,7 @@ def pictures(view: View, channel: CanChannel, stopped: Callable[[], bool]) -> It
     interval = watchdog_interval() or math.inf
     while not stopped():
         frames = channel.drain()
-        now = clock()
+        now = time.clock_gettime(time.CLOCK_BOOTTIME)  # runs while the board sleeps: numbers from before are old
         for frame in frames:
             view.take(frame, now)
         if frames or now - looked >= AGE_S:
@@ -127,11 +127,6 @@ def pictures(view: View, channel: CanChannel, stopped: Callable[[], bool]) -> It
             fed = now
         time.sleep(POLL_S)
     notify(STOPPING=1)
-
-
-def clock() -> float:
-    """Time since boot [s], suspended or not: numbers from before the board slept are old."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 @contextmanager

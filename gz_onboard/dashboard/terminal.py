@@ -20,8 +20,6 @@ from gz_onboard.events import KEEPING, NO_SENSOR, Reason, cause_words, words
 
 REDRAW_S, LINE_S = 0.2, 0.95  # at least, between two screens, and two lines
 INDENT, WIDEST = 20, 78  # columns: before the texts, and of the whole
-ROUND = 1, 1.5, 2, 3, 4, 5, 6, 8, 10
-"""First digits of the end of a scale."""
 
 Line = tuple[str, str, str]
 """Label, text, and ANSI codes of the text; without colour the text itself says everything."""
@@ -45,8 +43,11 @@ def show(pictures: Iterator[Picture], comments: Mapping[str, str], once: bool) -
     out: TextIO | None = sys.stdout
     if out is None:  # closed by the caller
         raise InputError("there is no standard output to show anything on")
-    in_front = threading.current_thread() is threading.main_thread()
-    terminal = in_front and out.isatty() and os.environ.get("TERM", "dumb") != "dumb"
+    terminal = (
+        threading.current_thread() is threading.main_thread()
+        and out.isatty()
+        and os.environ.get("TERM", "dumb") != "dumb"
+    )
     colour, on_screen = terminal and "NO_COLOR" not in os.environ, terminal and not once
     picture, drawn = None, -math.inf
     with _other_screen(out) if on_screen else nullcontext():
@@ -180,4 +181,4 @@ def _band(ranges: Mapping[str, float | None], cells: int) -> tuple[str, str]:
 def scale_end(value: float) -> float:
     """The next round number from `value` on, at least 1."""
     size = 10.0 ** math.floor(math.log10(max(value, 1.0)))
-    return next(step * size for step in ROUND if step * size >= value)
+    return next(step * size for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * size >= value)

@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Container
+from contextlib import suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -33,9 +34,6 @@ RIDING_DEGC = -20.0, 60.0  # usual in data sheets of lithium-ion cells; where th
 CHARGING_DEGC = 0.0, 45.0  # likewise
 LONGEST_DAY_M = 86_400 * STEP_LIMITS[ODOMETER][2]
 CLOCK_SET_NS = 10**18  # since 1970; an earlier time is of a board whose clock was not set
-
-UNKNOWN: dict[str, Any] = dict.fromkeys(("cells", "speed_km_h", "odometer_km", "ridden_today_km"))
-"""What `VehicleFrames.values` gives before any frame."""
 
 
 class VehicleFrames:
@@ -68,9 +66,9 @@ class VehicleFrames:
         }
         self._latest: dict[str, tuple[float, float, int]] = {}  # by role: value, when it came [s], its stamp [ns]
         self._day = Day(day_file, vehicle.name)
-        riding = cell_limits(vehicle.derating)
-        self.riding_limits = riding  # degC, of the cells
-        self.charging_limits = max(riding[0], CHARGING_DEGC[0]), min(riding[1], CHARGING_DEGC[1])
+        self.has_positions = {"latitude", "longitude"} <= self._period.keys()
+        self.riding_limits = low, high = cell_limits(vehicle.derating)  # degC
+        self.charging_limits = max(low, CHARGING_DEGC[0]), min(high, CHARGING_DEGC[1])
 
     def take(self, frame: Frame, now: float) -> None:
         """Take a frame that came at `now`; others, and those that fail a check, are ignored."""
@@ -100,7 +98,7 @@ class VehicleFrames:
             "odometer_km": None if metres is None else round(metres / 1e3, 1),
             "ridden_today_km": None if metres is None else self._day.ridden_km,
         }
-        return shown | {"position": self._position(fresh)} if "longitude" in self._period else shown
+        return shown | {"position": self._position(fresh)} if self.has_positions else shown
 
     def _position(self, fresh: dict[str, float]) -> dict[str, Any] | None:
         """Where the vehicle is, and the time stamp [ns] of the longitude; None without a fix."""
@@ -137,11 +135,15 @@ class Day:
     def __init__(self, file: Path | None, vehicle: str) -> None:
         self.ridden_km: float | None = None
         self._file, self._vehicle = file, vehicle
-        self._date, self._begin = _read_day(file, vehicle) if file else ("", 0.0)  # odometer [m] when it began
+        self._date, self._begin = "", 0.0  # odometer [m] when it began
         self._last: float | None = None  # m
         self._reported = SelfReported(ODOMETER)
-        if self._begin:
-            self._reported.accepted = self._begin, -inf
+        # A file that is damaged, missing or another vehicle's keeps no day.
+        with suppress(OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            kept = json.loads(file.read_text(encoding="utf-8")) if file else {}
+            begin = 1e3 * float(kept["odometer_km"])
+            if kept["vehicle"] == vehicle and 0 < begin < inf:
+                self._date, self._begin, self._reported.accepted = str(kept["date"]), begin, (begin, -inf)
 
     def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
         """Take the odometer [m] of a time [ns since 1970], which came at `now` [s]; False if it is implausible."""
@@ -169,13 +171,3 @@ class Day:
             new.replace(file)
         except OSError as error:
             print(f"dashboard: the start of the day is not kept: {file}: {error.strerror}", file=sys.stderr)
-
-
-def _read_day(file: Path, vehicle: str) -> tuple[str, float]:
-    """Date and odometer [m]; of a file that is damaged, missing or another vehicle's, no date."""
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        date, odometer, whose = str(found["date"]), 1e3 * float(found["odometer_km"]), found["vehicle"]
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        return "", 0.0
-    return (date, odometer) if whose == vehicle and 0 <= odometer < inf else ("", 0.0)

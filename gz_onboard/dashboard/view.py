@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal, sensor_signal
-from gz_onboard.dashboard.vehicle_frames import LATE_PERIODS, UNKNOWN, VehicleFrames
+from gz_onboard.dashboard.vehicle_frames import LATE_PERIODS, VehicleFrames
 from gz_onboard.events import (
     NO_PACK,
     NO_SENSOR,
@@ -37,7 +37,6 @@ Picture = dict[str, Any]
 
 VERSION = 1  # of the keys of a picture
 TREND_STEP, TREND_STEPS = 10.0, 60  # s between the ranges of the last ten minutes, and their number
-PERIODS_MS = {"RANGE_Status": 100}  # where the DBC file does not say; 1000 for other messages
 NEARLY_EMPTY, NO_LONGER_EMPTY = 15.0, 17.0  # %: state of charge at which the alert begins, and ends
 CELL_HYSTERESIS = 2.0  # K: an alert about a cell ends this far within the limit
 NO_NEWS = "age_s", "counts", "vehicle_counts"
@@ -65,7 +64,8 @@ class ReceivedMessage:
 
     def __init__(self, definition: Message) -> None:
         name, signals = definition.name, definition.signals
-        self.period = (definition.cycle_time or PERIODS_MS.get(name, 1000)) / 1000  # s
+        # The DBC file says it in milliseconds, or not at all.
+        self.period = (definition.cycle_time or (100 if name == "RANGE_Status" else 1000)) / 1000  # s
         self.time = -math.inf  # s, of the last good frame
         self.values: dict[str, float | None] = {}  # of the last good frame, in the units of the DBC file
         self.received = self.lost = self.bad = 0  # lost: by the counter; bad: failed a check
@@ -112,6 +112,7 @@ class View:
         self.messages = {name: ReceivedMessage(message) for name, message in publisher.messages.items()}
         self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent.items()}
         self._vehicle = vehicle
+        self.has_positions = vehicle is not None and vehicle.has_positions
         others = vehicle.identifiers if vehicle else []
         self.identifiers = None if others is None else [*self._by_identifier, *others]  # None: any may be of use
         self._seen_sensors = 0  # by their reasons, the sensors that have worked since the daemon started
@@ -179,7 +180,8 @@ class View:
                 "soc_sigma_percent": number("StateOfChargeSigma"),
                 "energy_left_wh": number("EnergyLeft"),
             },
-            **(self._vehicle.values(now, distrusted) if self._vehicle else UNKNOWN),
+            **dict.fromkeys(("cells", "speed_km_h", "odometer_km", "ridden_today_km")),
+            **(self._vehicle.values(now, distrusted) if self._vehicle else {}),
             "consumption": {
                 # Nobody knows how old the last kilometre is while there is no estimate.
                 "recent_wh_per_km": None if state is State.INVALID else number("ConsumptionRecent"),
@@ -222,10 +224,8 @@ class View:
     def _trend(self, km: float | None, now: float) -> list[float | None]:
         """Ranges [km], one each `TREND_STEP` of the last ten minutes, the oldest first; empty if there is none now."""
         step = int(now // TREND_STEP)
-        if step not in self._ranges:
-            self._ranges = {i: known for i, known in self._ranges.items() if i > step - TREND_STEPS}
-        self._ranges[step] = km
-        return [] if km is None else [self._ranges.get(i) for i in range(step - TREND_STEPS + 1, step + 1)]
+        self._ranges = {i: self._ranges.get(i) for i in range(step - TREND_STEPS + 1, step)} | {step: km}
+        return [] if km is None else list(self._ranges.values())
 
     def _alerts_of(self, shown: Picture, waiting: bool) -> list[str]:
         """Those of `ALERTS` that hold."""

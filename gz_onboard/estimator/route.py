@@ -213,7 +213,7 @@ class PreparedRoute:
 
         self._np, self.route, self.position = np, route, RoutePosition(route)
         profile = speed_profile(route, top_speed=top_speed if min(route.speed_limit) == inf else inf)
-        self.distance, self.speed = np.array(profile.distance), np.array(profile.speed)
+        self.distance, self.speed = map(np.array, profile)
         middles = (self.distance[1:] + self.distance[:-1]) / 2
         known = {"grade": route.grade, "curvature": route.curvature, "heading": route.heading}
         known |= {"headwind": route.headwind or (0.0,) * len(route.distance)}

@@ -1,1 +1,1 @@
-"""The road as a file has it: what is known of a route, and the speed that it allows."""
+"""Routes: how they are read from files, and the speed that they allow."""

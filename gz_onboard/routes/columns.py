@@ -30,9 +30,6 @@ class Columns:
     places: tuple[str, ...]  # what errors call each row
     values: dict[str, tuple[float, ...]]
 
-    def __len__(self) -> int:
-        return len(self.places)
-
     def error(self, row: int, message: str) -> InputError:
         """The error to raise about `row`, counted from 0."""
         return InputError(f"{self.places[row]}: {message}")

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import logging
 import math
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -118,8 +117,8 @@ def route_of(columns: Columns, name: str) -> Route:
     """
     import numpy as np
 
-    if len(columns) > CONFIG.max_points:
-        raise InputError(f"{columns.source}: has {len(columns)} points, must have at most {CONFIG.max_points}")
+    if len(columns.places) > CONFIG.max_points:
+        raise InputError(f"{columns.source}: has {len(columns.places)} points, must have at most {CONFIG.max_points}")
     columns = _with_filled_heights(columns)
     values = columns.values
     for column, limits in LIMITS.items():
@@ -128,7 +127,7 @@ def route_of(columns: Columns, name: str) -> Route:
     speed_limits = [column for column in SPEED_LIMITS if column in values]
     if len(speed_limits) > 1:
         raise InputError(f"{columns.source}: has {' and '.join(speed_limits)}; must have one speed limit")
-    speed_limit = (math.inf,) * len(columns)
+    speed_limit = (math.inf,) * len(columns.places)
     for column in speed_limits:
         speed_limit = tuple(limit * SPEED_LIMITS[column] for limit in values[column])
     distance, track = _distance(columns)
@@ -177,10 +176,13 @@ def _with_filled_heights(columns: Columns) -> Columns:
     count = int(missing.sum())
     if not 0 < 2 * count < len(heights):
         return columns
-    rows = np.arange(len(heights))
-    filled = np.interp(rows, rows[~missing], heights[~missing])
-    place = columns.places[int(missing.argmax())]
-    _LOG.warning("%s: %d of %d heights are missing, the first here: filled from neighbours", place, count, len(heights))
+    filled = np.interp(np.arange(len(heights)), np.flatnonzero(~missing), heights[~missing])
+    _LOG.warning(
+        "%s: %d of %d heights are missing, the first here: filled from neighbours",
+        columns.places[int(missing.argmax())],
+        count,
+        len(heights),
+    )
     return replace(columns, values=columns.values | {"altitude_m": tuple(filled.tolist())})
 
 
@@ -254,28 +256,6 @@ def _slopes(x: Array, y: Array, at: Array, length: float) -> Array:
     return np.array(slopes)
 
 
-@dataclass(frozen=True)
-class SpeedProfile:
-    """Target `speed` [m/s] over `distance` [m] and the `time` [s] at which it is reached; tuples of one length.
-
-    Acceleration is constant between points. The ride begins and ends at standstill: a rider who follows speed over
-    distance must look a little ahead, or follow speed over time.
-    """
-
-    distance: tuple[float, ...]
-    speed: tuple[float, ...]
-    time: tuple[float, ...]
-
-    def speed_at(self, distance: float) -> float:
-        """Target speed [m/s] at `distance` [m]; 0 before the start and past the end."""
-        if not 0.0 <= distance <= self.distance[-1]:
-            return 0.0
-        i = min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1
-        part = (distance - self.distance[i]) / (self.distance[i + 1] - self.distance[i])
-        v0, v1 = self.speed[i], self.speed[i + 1]
-        return math.sqrt(v0 * v0 + part * (v1 * v1 - v0 * v0))
-
-
 def speed_profile(
     route: Route,
     *,
@@ -283,12 +263,13 @@ def speed_profile(
     acceleration: float = 1.2,
     deceleration: float = 1.5,
     top_speed: float = math.inf,
-) -> SpeedProfile:
-    """The fastest ride of `route`, from standstill to standstill, within its limits and the rider's.
+) -> tuple[list[float], list[float]]:
+    """Distances [m] and speeds [m/s] of the fastest ride of `route`, from standstill to standstill.
 
     At the route's stops it comes to a halt, for no time. Speed stays within the speed limit, `top_speed` [m/s] and
     √(lateral_acceleration/|curvature|), everywhere and not only at points; it rises and falls with at most
-    `acceleration` and `deceleration` (all in m/s²). Points are the route's and others between them.
+    `acceleration` and `deceleration` (all in m/s²), constant between points. Points are the route's and others between
+    them.
     """
     distance = [0.0]
     curve: list[float] = [abs(route.curvature[0])]
@@ -311,6 +292,4 @@ def speed_profile(
         square[i + 1] = min(square[i + 1], square[i] + 2 * acceleration * length)
     for i, length in reversed(list(enumerate(lengths))):
         square[i] = min(square[i], square[i + 1] + 2 * deceleration * length)
-    speed = [math.sqrt(v2) for v2 in square]
-    durations = (2 * length / (v0 + v1) for length, (v0, v1) in zip(lengths, pairwise(speed), strict=True))
-    return SpeedProfile(tuple(distance), tuple(speed), tuple(accumulate(durations, initial=0.0)))
+    return distance, [math.sqrt(v2) for v2 in square]

@@ -154,12 +154,13 @@ def _route_plan(path: Path, options: SimulationOptions, roller: Dynamometer | No
     if options.repeat > 1 or options.until_empty:
         raise InputError(f"{path}: a route is ridden once, as it does not end where it starts; --repeat is for cycles")
     route = _with_heights(path)
-    profile = speed_profile(route, top_speed=TOP_SPEED)
-    metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
+    import numpy as np
+
+    distance, speed = map(np.array, speed_profile(route, top_speed=TOP_SPEED))
+    duration = float(np.sum(2 * np.diff(distance) / (speed[1:] + speed[:-1])))
+    metres = np.sqrt(np.interp(np.arange(int(route.length) + 1), distance, speed**2)).tolist()
     road = roller or road_table(route.distance, route.grade, route.curvature, options.wind)
-    return Plan(
-        route.name, "route", profile.time[-1], road, lambda: along(metres), route.length, heading=route.heading[0]
-    )
+    return Plan(route.name, "route", duration, road, lambda: along(metres), route.length, heading=route.heading[0])
 
 
 def _ride_plan(path: Path, options: SimulationOptions, vehicle: Vehicle, roller: Dynamometer | None) -> Plan:

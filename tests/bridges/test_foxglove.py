@@ -226,7 +226,7 @@ def test_a_vehicle_without_positions(tmp_path, capsys):
     (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"'))
     arguments = ["--interface", "virtual", "--listen", "127.0.0.1:0", "--duration", "0.1"]
     assert cli.main(["foxglove", *arguments, "--vehicle", str(tmp_path / "truck.toml")]) == 0
-    assert "truck.toml: [roles] has no longitude: no position is shown" in capsys.readouterr().out
+    assert "truck.toml: [roles] must have latitude and longitude: no position is shown" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("client", CLIENTS)

@@ -231,7 +231,7 @@ def test_units_and_classes_go_together():
     """As Home Assistant's documentation has them; a pair that it does not know makes it drop the sensor."""
     known = {"distance": "km", "battery": "%", "energy_storage": "Wh", "energy_distance": "Wh/km", "power": "W"}
     known |= {"duration": "min", "temperature": "°C"}
-    about: Any = mqtt.discovery("scooter")
+    about: Any = mqtt.discovery("scooter", STATE)
     assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(mqtt.SENSORS)
     for key, sensor in about["components"].items():
         assert re.fullmatch("[a-z0-9_]+", key)

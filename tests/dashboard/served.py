@@ -14,7 +14,7 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.dashboard.command import clock, pictures
+from gz_onboard.dashboard.command import pictures
 from gz_onboard.dashboard.server import Feed, served
 from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.dashboard.view import TREND_STEP, View, encoded
@@ -31,7 +31,7 @@ def dashboard(
 ) -> Iterator[str]:
     """The address of a dashboard of the virtual bus `channel`, which has seen the ranges `trend` [m], 10 s apart."""
     view, stop, feed = View(vehicle=vehicle), threading.Event(), Feed()
-    publisher, start = Publisher(), clock() - TREND_STEP * len(trend)
+    publisher, start = Publisher(), time.clock_gettime(time.CLOCK_BOOTTIME) - TREND_STEP * len(trend)
     for i, metres in enumerate(trend):
         past = replace(ESTIMATE, range=metres, range_p10=0.9 * metres, range_p90=1.1 * metres)
         for frame in publisher.range(past, COUNTS, 0):

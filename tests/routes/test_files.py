@@ -102,9 +102,9 @@ def test_stops_and_winds_of_a_csv(tmp_path):
     file.write_text("distance_m,stop_s,headwind_mps\n" + rows)
     route = read_route(file)
     assert (route.stop[10], route.headwind[3]) == (30.0, 3.0)
-    profile = speed_profile(route, top_speed=12.0)
-    assert profile.speed_at(200.0) == 0.0
-    assert profile.speed_at(190.0) > 3.0
+    speed = dict(zip(*speed_profile(route, top_speed=12.0), strict=True))
+    assert speed[200.0] == 0.0
+    assert speed[190.0] > 3.0
 
 
 @pytest.mark.parametrize(
