@@ -17,11 +17,19 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, by_response
 from gz_onboard.bus.checksum import crc_differences
-from gz_onboard.bus.layout import Column, Layout, identifier_of, is_not_available, plausible_range, raw_range
+from gz_onboard.bus.layout import (
+    Column,
+    Layout,
+    MessageSignals,
+    Values,
+    identifier_of,
+    is_not_available,
+    plausible_range,
+    raw_range,
+)
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.origins import Origin, Origins
 from gz_onboard.bus.requests import FUNCTIONAL
-from gz_onboard.bus.signals import MessageSignals, Values
 from gz_onboard.events import (
     ERR_FLAG,
     RTR_FLAG,

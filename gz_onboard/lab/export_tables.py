@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.bus.signals import Decoded, Decoder
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC
 from gz_onboard.offline import write_tables
+from gz_onboard.offline.decode_signals import Decoded, Decoder
 from gz_onboard.offline.table import table_columns
 from gz_onboard.recording import logs
 from gz_onboard.recording.frames import FrameColumns

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.signals import Decoder
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
+from gz_onboard.offline.decode_signals import Decoder
 from gz_onboard.recording import logs
 
 if TYPE_CHECKING:

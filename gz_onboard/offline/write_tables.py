@@ -11,8 +11,8 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import IO, Any, cast
 
-from gz_onboard.bus.signals import Decoded
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED
+from gz_onboard.offline.decode_signals import Decoded
 from gz_onboard.recording.frames import FrameColumns
 
 

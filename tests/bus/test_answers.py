@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Assembler
 from gz_onboard.bus.codec import LENGTH, RANGE, Codec
-from gz_onboard.bus.signals import Decoder
 from gz_onboard.events import Frame
+from gz_onboard.offline.decode_signals import Decoder
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, events_of

@@ -26,9 +26,9 @@ from gz_onboard.bus.codec import (
 )
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
-from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
+from gz_onboard.offline.decode_signals import Decoder
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, events_of

@@ -17,9 +17,8 @@ from mcap.reader import make_reader
 
 from gz_onboard.background import Background
 from gz_onboard.bus import framelog, logfile
-from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
+from gz_onboard.bus.recorder import BackgroundRecorder, LogLimits, Recorder, is_complete
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 from gz_onboard.recording import logs
@@ -471,7 +470,7 @@ def test_the_thread_is_woken_once_a_tick(tmp_path: Path, monkeypatch: pytest.Mon
             calls += 1
             return super().call(function, *arguments, weight=weight)
 
-    monkeypatch.setattr("gz_onboard.bus.background_recorder.Background", Counting)
+    monkeypatch.setattr("gz_onboard.bus.recorder.Background", Counting)
     behind = BackgroundRecorder(Recorder(tmp_path, "ref"), limit=10**9)
     behind.channel("/estimate", SCHEMA)
     batches = ticks(4)
@@ -498,7 +497,7 @@ class Prompt(Background):
 def test_it_goes_on_syncing_though_a_sync_is_done_before_its_caller_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gz_onboard.bus.background_recorder.Background", Prompt)
+    monkeypatch.setattr("gz_onboard.bus.recorder.Background", Prompt)
     synced: list[int] = []
     monkeypatch.setattr(os, "fdatasync", synced.append)
     behind = BackgroundRecorder(Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5)), limit=10**9)

@@ -17,10 +17,10 @@ from mcap.reader import make_reader
 from gz_onboard import cli
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.signals import Decoder, column_name
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export as command
+from gz_onboard.offline.decode_signals import Decoder, column_name
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.vehicle import read_vehicle

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.answers import NEGATIVE, AnswerReader, by_response
-from gz_onboard.bus.layout import Layout, raw_range
+from gz_onboard.bus.layout import MessageSignals, Values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
 from gz_onboard.events import Frame
@@ -15,32 +15,8 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
-Values = dict[str, "float | int | None"]
 Decoded = tuple[int, str, Values]
 """(time [ns], message, value by column): one frame's signals."""
-
-
-class MessageSignals:
-    """Decodes all signals of one message. not_available: whether all ones mean that."""
-
-    def __init__(self, message: Message, not_available: bool = True) -> None:
-        self._length = message.length
-        self._layout = Layout(message, message.signals)
-        self._limits = [raw_range(signal, not_available) for signal in message.signals]
-
-    def values(self, data: bytes) -> Values | None:
-        """The value of each signal in the unit of the DBC: None where not available or out of the DBC's range.
-
-        Without those of other branches of the multiplexer; None if the data do not fit the message.
-        """
-        if len(data) != self._length:
-            return None
-        columns, values = self._layout.columns(data, 1), Values()
-        for place, (signal, (low, high)) in enumerate(zip(self._layout.signals, self._limits, strict=False)):
-            if self._layout.rows(place, columns) != []:
-                raw = columns[place][0]  # NaN is not between any limits
-                values[signal.name] = signal.conversion.raw_to_scaled(raw, False) if low <= raw <= high else None  # type: ignore[assignment]  # a number
-        return values
 
 
 class Decoder:
