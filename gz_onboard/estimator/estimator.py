@@ -18,8 +18,6 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import PresentLoad
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
 from gz_onboard.estimator.plausibility import Plausibility
-from gz_onboard.estimator.plausibility.electrical import CellEvidence
-from gz_onboard.estimator.plausibility.residual import StepInputs
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.snapshot import VERSION, check_snapshot
@@ -72,8 +70,10 @@ class Estimator:
         make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
-        self.motion, self.forecaster = Motion(), Forecaster(model, battery, riding)
+        self.forecaster = Forecaster(model, battery, riding)
         self.signals = Signals(groups, battery.window.of_cells)
+        p = model.parameters
+        self.motion = Motion(self.signals, p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"])
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
         self.explainer = RangeExplainer(self.forecaster)
@@ -86,9 +86,8 @@ class Estimator:
         self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activity, self._reading = ActivityTracker(), PackReading()
         self._distrusted: tuple[str, ...] = ()
-        p = model.parameters
-        self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
-        self.plausibility = Plausibility(self.signals, battery, p, model.mass)
+        models = self._cell_error, self._road_power, self._level_power
+        self.plausibility = Plausibility(self.signals, battery, p, model.mass, *models)
         self._temperatures = Temperatures(self.signals, p)
         self.soc = StateOfCharge(battery, model, make, self.signals, self.plausibility.pack.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
@@ -129,10 +128,11 @@ class Estimator:
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
-        self.plausibility.step(StepInputs(now, dt, elapsed, signals, motion.speed))
-        motion.step(now, elapsed, signals, self._radius, self._gear)
+        self.plausibility.limits.step(now, elapsed, motion.speed)
+        self.plausibility.speeds.step(now, elapsed, gap=elapsed < dt)
+        motion.step(now, elapsed)
         self._reading = self._read_pack(now, elapsed)
-        self._compare_grades(now, elapsed)
+        self._compare_grades(now, elapsed, gap=elapsed < dt)
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self.signals.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._load)
@@ -157,7 +157,7 @@ class Estimator:
             came = odometer.time >= self._clock_leap - WINDOW
             if not came and now - self._clock_leap < ODOMETER_WITHIN:
                 return None
-            self.motion.step(now, 0.0, self.signals, self._radius, self._gear)  # how fast it is now
+            self.motion.step(now, 0.0)  # how fast it is now
             least = min(speed, self.motion.speed or 0.0) * dt / 2
             if came and 0 <= moved + self._odometer_step < least:
                 dt, moved = max(now - self._clock_leap, WINDOW), 0.0
@@ -168,17 +168,7 @@ class Estimator:
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """What the pack gives by the sensors, else by the model."""
-        cells = self._temperatures.cells_or_bench
-
-        def road_power() -> float | None:
-            known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
-            return self._load.power(now) if known else None
-
-        def error(voltage: float, current: float, sensor: str) -> float | None:
-            return self.soc.cell_error(now, (voltage, current), sensor, cells)
-
-        evidence = CellEvidence(error, road_power, self.soc.gate.rms)
-        reading = self.plausibility.pack.read(now, dt, self.motion.speed, evidence)
+        reading = self.plausibility.pack.read(now, dt, self.motion.speed, self.soc.gate.rms)
         self.soc.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
@@ -188,20 +178,32 @@ class Estimator:
             return reading._replace(current=self._load.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
-    def _compare_grades(self, now: float, dt: float) -> None:
+    def _cell_error(self, voltage: float, current: float, sensor: str) -> float:
+        """What the sensor checks compare with, as the next two."""
+        cells = self._temperatures.cells_or_bench
+        return self.soc.cell_error(self._time or 0.0, (voltage, current), sensor, cells) or 0.0
+
+    def _road_power(self) -> float | None:
+        known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
+        return self._load.power(self._time or 0.0) if known else None
+
+    def _level_power(self, speed: float, acceleration: float) -> float:
+        return self._load.power_at(self._time or 0.0, speed, acceleration)
+
+    def _compare_grades(self, now: float, dt: float, gap: bool) -> None:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
-        grades, speeds, reading = self.plausibility.grades, self.plausibility.speeds, self._reading
+        grades, reading = self.plausibility.grades, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
         towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
-        before = grades.faulty
-        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._load.power_at(now, v, a))
-        if grades.faulty != before:
-            self.motion.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
+        grades.compare(now, dt, gap, power)
         left_out, self._distrusted = self._distrusted, self.plausibility.distrusted
         if self._distrusted == left_out:
             return
-        newly = set(self._distrusted).difference(left_out)
+        changed = set(self._distrusted).symmetric_difference(left_out)
+        if changed & {"accel_x", "gps_altitude"}:
+            self.motion.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
+        newly = changed.difference(left_out)
         learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SPEEDS)
         if forgotten := newly & learned:
             self.forecaster.forget(max(UNLEARNED, self.plausibility.speeds.odometer.compared))

@@ -56,61 +56,75 @@ class MotionConfig:
 MOTION = MotionConfig()
 
 
-def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:
-    """(low-passed speed [m/s], acceleration [m/s²]) after `dt` [s], from the low-passed speed before."""
-    if dt < MOTION.speed_time:
-        rate = (speed - slow) / MOTION.speed_time  # of the lag before this step, to which a steady rate settles
-        return slow + rate * dt, rate
-    return speed, (speed - slow) / dt  # slow messages: the mean over the step
-
-
-@dataclass(slots=True)
 class Motion:
-    """State and result of the motion filter. None: not known, for want of sensors."""
+    """State and result of the motion filter. None: not known, for want of sensors.
 
-    speed: float | None = None  # m/s
-    acceleration: float | None = None  # m/s²
-    grade: float | None = None  # sine of the road's angle
-    lean: float | None = None  # rad, positive to the right
-    yaw_rate: float | None = None  # rad/s, positive to the left
-    heading: float | None = None  # rad, clockwise from north
-    altitude: float | None = None  # m, as the observer has it
-    distance: float = 0.0  # m
-    gyro_bias: tuple[float, float] = (0.0, 0.0)  # rad/s, of roll and yaw rate
-    slow_speed: float = 0.0  # m/s, low-passed
-    accelerometer_grade: float = 0.0
-    grade_offset: float = 0.0
-    levelled: float = 0.0  # m over which the offset was sought: before, an accelerometer shows its mounting, too
+    wheel_radius: of the driven wheel [m]; gear_ratio: wheel speed over what the motor's sensor shows.
+    """
 
-    def step(self, now: float, dt: float, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
+    def __init__(self, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
+        self._signals = signals
+        self._speeds = [(signals[role], factor) for role, factor in speed_factors(wheel_radius, gear_ratio).items()]
+        self.speed: float | None = None  # m/s
+        self.acceleration: float | None = None  # m/s²
+        self.grade: float | None = None  # sine of the road's angle
+        self.lean: float | None = None  # rad, positive to the right
+        self.yaw_rate: float | None = None  # rad/s, positive to the left
+        self.heading: float | None = None  # rad, clockwise from north
+        self.altitude: float | None = None  # m, as the observer has it
+        self.distance = 0.0  # m
+        self.gyro_bias = 0.0, 0.0  # rad/s, of roll and yaw rate
+        self._slow_speed = 0.0  # m/s, low-passed
+        self._accelerometer_grade = self._grade_offset = 0.0
+        self._levelled = 0.0  # m over which the offset was sought: before, an accelerometer shows its mounting, too
+
+    def step(self, now: float, dt: float) -> None:
         """Go `dt` [s] ahead to `now` [s]."""
-        factors = speed_factors(wheel_radius, gear_ratio).items()
-        speeds = (shown * factor for role, factor in factors if (shown := signals[role].mean) is not None)
-        speed = next(speeds, None)
-        if speed is None:
-            self.speed = self.acceleration = None
-        else:
-            slow = speed if self.speed is None else self.slow_speed
-            self.speed, (self.slow_speed, self.acceleration) = speed, accelerated(slow, speed, dt)
-            self.distance += abs(speed) * dt
-        self._update_lean(now, dt, signals)
-        self._update_heading(now, dt, signals)
-        self._update_grade(now, dt, signals)
+        before, self.speed, self.acceleration = self.speed, None, None
+        for signal, factor in self._speeds:
+            if signal.reported is not None and signal.trusted:
+                self._follow_speed(dt, before, signal.reported * factor)
+                break
+        self._update_turning(now, dt)
+        self._update_grade(now, dt)
+
+    def _follow_speed(self, dt: float, before: float | None, speed: float) -> None:
+        slow = speed if before is None else self._slow_speed
+        if dt < MOTION.speed_time:  # the lag before this step, to which a steady rate settles
+            self.acceleration = (speed - slow) / MOTION.speed_time
+            self._slow_speed = slow + self.acceleration * dt
+        else:  # the mean over the step
+            self.acceleration, self._slow_speed = (speed - slow) / dt, speed
+        self.speed = speed
+        self.distance += abs(speed) * dt
 
     def forget_grade(self, grade_offset: float, altitude_holds: bool) -> None:
         """Start the grade again: a sensor that it was made from is faulty; `grade_offset` is still known.
 
         altitude_holds: the observer starts from the measured altitude. Where the fault led it is no climb.
         """
-        self.grade_offset, self.accelerometer_grade = grade_offset, 0.0
+        self._grade_offset, self._accelerometer_grade = grade_offset, 0.0
         if altitude_holds:
             self.altitude = None
 
-    def _update_lean(self, now: float, dt: float, signals: Signals) -> None:
-        roll, yaw, speed = signals.rate_x.mean, signals.rate_z.mean, self.speed
+    def _update_turning(self, now: float, dt: float) -> None:
+        signals, speed, heading = self._signals, self.speed, self.heading
+        roll, yaw = signals.rate_x.mean, signals.rate_z.mean
         if roll is None or yaw is None or speed is None:
             self.lean = self.yaw_rate = None
-            return
+        else:
+            self._update_lean(dt, speed, roll, yaw)
+        moves = (signals.gps_speed.get(now) or 0.0) > MOTION.turning_speed
+        course = signals.gps_course.get(now) if moves else None
+        if heading is None or (self.yaw_rate is None and course is None):
+            heading = course
+        else:
+            heading -= (self.yaw_rate or 0.0) * dt
+        if heading is not None and course is not None:
+            heading += atan2(sin(course - heading), cos(course - heading)) * min(dt / MOTION.course_time, 1.0)
+        self.heading = None if heading is None else heading % (2 * pi)
+
+    def _update_lean(self, dt: float, speed: float, roll: float, yaw: float) -> None:
         (bias_x, bias_z), share = self.gyro_bias, min(dt / MOTION.gyro_bias_time, 1.0)
         if abs(speed) < MOTION.standstill and max(abs(roll), abs(yaw)) < MOTION.max_gyro_bias:
             bias_x, bias_z = bias_x + (roll - bias_x) * share, bias_z + (yaw - bias_z) * share
@@ -120,51 +134,38 @@ class Motion:
         if abs(speed) > MOTION.turning_speed:
             steady = -atan(speed * self.yaw_rate / GRAVITY)
         else:
-            steady = asin(min(max((signals.accel_y.mean or 0.0) / GRAVITY, -1.0), 1.0))
+            steady = asin(min(max((self._signals.accel_y.mean or 0.0) / GRAVITY, -1.0), 1.0))
         lean += (roll - bias_x) * dt
         self.lean = lean + (steady - lean) * min(dt / MOTION.lean_time, 1.0)
 
-    def _update_heading(self, now: float, dt: float, signals: Signals) -> None:
-        course, heading = signals.gps_course.get(now), self.heading
-        if (signals.gps_speed.get(now) or 0.0) <= MOTION.turning_speed:
-            course = None
-        if self.yaw_rate is None and course is None:
-            heading = None
-        elif heading is None:
-            heading = course
-        else:
-            heading -= (self.yaw_rate or 0.0) * dt
-        if heading is not None and course is not None:
-            heading += atan2(sin(course - heading), cos(course - heading)) * min(dt / MOTION.course_time, 1.0)
-        self.heading = None if heading is None else heading % (2 * pi)
-
-    def _update_grade(self, now: float, dt: float, signals: Signals) -> None:
+    def _update_grade(self, now: float, dt: float) -> None:
+        signals = self._signals
         forward = signals.accel_x.mean
         measured = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
         distrusted = not (signals.accel_x.trusted and signals.gps_altitude.trusted)
         nothing = forward is None and measured is None and (distrusted or self.altitude is None)
-        mounting = measured is None and self.levelled < MOTION.altitude_length
+        mounting = measured is None and self._levelled < MOTION.altitude_length
         if self.speed is None or nothing or mounting:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
             sine = min(max(grade_shown(forward, self.acceleration), -1.0), 1.0)
-            self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / MOTION.grade_time, 1.0)
+            self._accelerometer_grade += (sine - self._accelerometer_grade) * min(dt / MOTION.grade_time, 1.0)
         else:
-            self.accelerometer_grade = 0.0
+            self._accelerometer_grade = 0.0
         distance, altitude = abs(self.speed) * dt, self.altitude
         if altitude is not None:
-            altitude += (self.accelerometer_grade + self.grade_offset) * distance
+            altitude += (self._accelerometer_grade + self._grade_offset) * distance
         if measured is not None:
             if altitude is None or abs(measured - altitude) > MOTION.max_altitude_error:
                 altitude = measured  # it was away for long, or left out: where it is now teaches no grade
             length = MOTION.altitude_length_alone if forward is None else MOTION.altitude_length
             share = min(distance / length, MOTION.max_observer_gain)  # critically damped over distance
-            self.grade_offset += share * (measured - altitude) / length
+            self._grade_offset += share * (measured - altitude) / length
             altitude += 2 * share * (measured - altitude)
-            self.levelled += distance
+            self._levelled += distance
         self.altitude = None if altitude is None else min(max(altitude, MOTION.min_altitude), MOTION.max_altitude)
-        self.grade = min(max(self.accelerometer_grade + self.grade_offset, -MOTION.max_grade), MOTION.max_grade)
+        self.grade = min(max(self._accelerometer_grade + self._grade_offset, -MOTION.max_grade), MOTION.max_grade)
 
 
 class ActivityTracker:
@@ -184,6 +185,8 @@ class ActivityTracker:
         self._charging = 0.0  # s of a charging current without motion
         self._uncharged = inf  # s since the last such current that lasted
         self._drawing = 0.0  # s of a drive's current without motion, less those without it
+        self.takes_charge = False  # the pack is charged, or could be: nothing drives
+        self.teaches = False  # what flows now is part of a ride: motion, or a short stop
 
     def step(
         self,
@@ -209,7 +212,8 @@ class ActivityTracker:
         drawn = c_rate if drive is None else drive
         more = dt if drawn is not None and drawn > MOTION.drawing_rate else -dt
         self._drawing = 0.0 if moving else min(max(self._drawing + more, 0.0), MOTION.max_drawing)
-        speed = None if self._speed_is_wrong else speed
+        speed_is_wrong = self._drawing >= MOTION.drawing_after  # it must be moving
+        speed = None if speed_is_wrong else speed
         charged = c_rate is not None and c_rate < -MOTION.charging_rate and not moving
         self._charging = self._charging + dt if charged else 0.0
         self._uncharged = 0.0 if self._charging >= MOTION.charging_after else self._uncharged + dt
@@ -218,7 +222,7 @@ class ActivityTracker:
         without_speed = MOTION.silent_charging_after if inverter_silent else inf
         if (plugged and flows) or self._charging >= (without_speed if speed is None else MOTION.charging_after):
             self.now = Activity.CHARGING
-        elif plugged and not self._speed_is_wrong:
+        elif plugged and not speed_is_wrong:
             self.now = Activity.PARKED
         elif speed is None:
             self.now = Activity.UNKNOWN
@@ -227,28 +231,16 @@ class ActivityTracker:
         else:
             parked = off or min(self._still, self._followed) > MOTION.stop_time
             self.now = Activity.PARKED if parked else Activity.STANDING
+        charging = self.now is Activity.CHARGING
+        self.takes_charge = charging and self._drawing == 0
+        known = not (charging or speed_is_wrong or self._charging)
+        self.teaches = known and self._still <= MOTION.stop_time
 
     def shown(self, silent: bool, joined: bool) -> Activity:
         """The activity; silent: nothing comes from the bus; joined: no rest has shown the state of charge yet."""
         if silent:
             return Activity.UNKNOWN if self.now in (Activity.UNKNOWN, Activity.RIDING) else Activity.ASLEEP
         return Activity.JOINED if joined and self.now is Activity.RIDING else self.now
-
-    @property
-    def takes_charge(self) -> bool:
-        """Whether the pack is charged, or could be: nothing drives."""
-        return self.now is Activity.CHARGING and self._drawing == 0
-
-    @property
-    def teaches(self) -> bool:
-        """Whether what flows now is part of a ride: motion, or a short stop."""
-        known = self.now is not Activity.CHARGING and not self._speed_is_wrong
-        return known and self._charging == 0 and self._still <= MOTION.stop_time
-
-    @property
-    def _speed_is_wrong(self) -> bool:
-        """Whether the drive has drawn for so long at standstill that it must be moving."""
-        return self._drawing >= MOTION.drawing_after
 
 
 class VibrationMonitor:

@@ -142,11 +142,9 @@ class SlowMessage:
         self._stale = STALE_PERIODS * group.period if group.period else TIMING.unknown_stale  # s
         thermal = any("temperature" in role for role in group.roles)
         self._longest_stale = TIMING.longest_stale if thermal else TIMING.slow_stale_periods * TIMING.slowest
-        self._set_period(group.period or 0.0, self._stale)
-
-    def _set_period(self, period: float, stale: float) -> None:
-        for signal in self.signals:
-            signal.period, signal.stale_after = period, stale
+        self._period = group.period or 0.0  # s: as declared, then as it really is; 0 where gaps are short
+        for signal in signals:
+            signal.period, signal.stale_after = self._period, self._stale
 
     def learn_period(self, window: MessageWindow) -> bool:
         """Learn the real period of a message that comes with long gaps; whether it has changed.
@@ -157,19 +155,20 @@ class SlowMessage:
         self._last = window.time
         if gap > TIMING.slow_gap:
             self._gap, self._short = gap, 0
-            if not before or not 1 / TIMING.alike < gap / before < TIMING.alike or gap > TIMING.longest_stale:
-                return False
-            period = max(gap, before)
-            stale = max(self._stale, min(TIMING.slow_stale_periods * period, self._longest_stale))
-            self._set_period(period, stale)
-            return True
-        if not before:
+            alike = before and 1 / TIMING.alike < gap / before < TIMING.alike
+            period = max(gap, before) if alike and gap <= TIMING.longest_stale else self._period
+        elif before:
+            self._short += window.frames
+            long_gaps_are_over = self._short >= TIMING.fast_count
+            period, self._gap = (0.0, 0.0) if long_gaps_are_over else (self._period, before)
+        else:
             return False
-        self._short += window.frames
-        if self._short < TIMING.fast_count:
+        if period == self._period:
             return False
-        self._gap = 0.0
-        self._set_period(0.0, self._stale)
+        self._period = period
+        for signal in self.signals:
+            signal.period = period
+            signal.stale_after = max(self._stale, min(TIMING.slow_stale_periods * period, self._longest_stale))
         return True
 
 

@@ -19,7 +19,7 @@ from gz_onboard.estimator.initial import (
     SteadyVoltage,
     first_filter,
 )
-from gz_onboard.estimator.plausibility.electrical import VoltageSag
+from gz_onboard.estimator.plausibility.residual import ResponseGain
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
@@ -58,7 +58,7 @@ class RidingModel(Protocol):
 class StateOfCharge:
     """The filter of one pack, and what it is begun from."""
 
-    def __init__(self, battery: Battery, model: Model, make: FilterMaker, signals: Signals, sag: VoltageSag) -> None:
+    def __init__(self, battery: Battery, model: Model, make: FilterMaker, signals: Signals, sag: ResponseGain) -> None:
         self.filter: SocFilter | None = None
         self.gate = InnovationGate()
         self.ageing = Ageing(battery)
@@ -299,7 +299,7 @@ class StateOfCharge:
         if explaining is not None:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
-            self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
+            self._sag.update(dt, r0 * cell + beside * explaining + lost, -voltage / battery.cells_series)
         before = filter_.soc, filter_.error, filter_.covariance
         self.another_pack = self.ageing.permit(now, reading, self._signals, filter_)
         if dt <= self._signals.pause and self._rest.step(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.motion import Motion, accelerated
+from gz_onboard.estimator.motion import Motion
 from gz_onboard.events import ROLES
 from tests.events import ShownSignals
 
@@ -19,7 +19,7 @@ def drive(seconds, truth, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
     """Run the filter over `truth`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
     rng = np.random.default_rng(seed)
     signals = ShownSignals(*(role for role in ROLES if role not in without))
-    motion = Motion()
+    motion = Motion(signals, RADIUS, 1.0)
     heading, rows, before = 0.0, [], truth(0.0)
     for step in range(1, round(seconds / dt) + 1):
         t = step * dt
@@ -39,7 +39,7 @@ def drive(seconds, truth, *, without=(), altitude_until=1e9, seed=0, dt=0.1):
         if t >= altitude_until:
             del values["gps_altitude"]
         signals.show(t, {role: value for role, value in values.items() if role not in without})
-        motion.step(t, dt, signals, RADIUS, 1.0)
+        motion.step(t, dt)
         before = (speed, grade, lean, yaw, altitude)
         found = t, motion.speed, motion.grade, motion.lean, motion.yaw_rate, motion.heading
         rows.append((*found, grade, lean, yaw, heading))
@@ -67,11 +67,11 @@ def turning(t):
 
 
 def test_a_gyro_with_a_large_offset_is_learned_at_rest():
-    motion = Motion()
     signals = ShownSignals(*ROLES)
+    motion = Motion(signals, RADIUS, 1.0)
     for step in range(1, 300):
         signals.show(step * 0.1, {"motor_speed": 0.0, "rate_x": 0.1, "rate_z": -0.12, "accel_y": 0.0})
-        motion.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
+        motion.step(step * 0.1, 0.1)
     assert motion.gyro_bias[0] == pytest.approx(0.1, abs=0.005)
     assert motion.gyro_bias[1] == pytest.approx(-0.12, abs=0.005)
 
@@ -135,7 +135,9 @@ def test_distance_and_steady_turn_sign():
 
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.25, 1.0])
 def test_a_steady_acceleration_is_shown_as_it_is_whatever_the_step(dt):
-    slow = shown = 0.0
+    signals = ShownSignals("motor_speed")
+    motion = Motion(signals, RADIUS, 1.0)
     for step in range(round(5 / dt)):
-        slow, shown = accelerated(slow, 1.2 * dt * (step + 1), dt)
-    assert shown == pytest.approx(1.2, rel=1e-6)
+        signals.show(dt * step, {"motor_speed": 1.2 * dt * step / RADIUS})
+        motion.step(dt * step, dt)
+    assert motion.acceleration == pytest.approx(1.2, rel=1e-6)

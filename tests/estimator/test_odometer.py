@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gz_onboard.estimator.plausibility.residual import StepInputs, faulty
+from gz_onboard.estimator.plausibility.residual import faulty
 from gz_onboard.estimator.plausibility.speeds import SpeedCheck
 from gz_onboard.events import ROLES, Activity
 from tests.estimator.life import MOTOR, Scooter, estimator, follow
@@ -19,7 +19,8 @@ Odometer = Callable[[float, float], float | None]
 
 def ridden(odometer: Odometer, wheel: Callable[[float, float], float], seconds: float = 2400.0) -> set[str]:
     """Who is named. odometer: what it says of (time [s], distance [m]); None: nothing. wheel: of (time, speed)."""
-    signals, speeds = ShownSignals(*ROLES), SpeedCheck(RADIUS, GEAR, 30.0)
+    signals = ShownSignals(*ROLES)
+    speeds = SpeedCheck(signals, RADIUS, GEAR, 30.0)
     distance, named = 0.0, set[str]()
     for i in range(round(seconds / STEP)):
         t = i * STEP
@@ -28,8 +29,8 @@ def ridden(odometer: Odometer, wheel: Callable[[float, float], float], seconds: 
         told = odometer(t, distance)
         if i % 10 == 0 and told is not None:
             signals.odometer.value, signals.odometer.time = told, t
-        speeds.step(StepInputs(t, STEP if i else 0.0, STEP if i else 0.0, signals, None))
-        named |= faulty(speeds.counters)
+        speeds.step(t, STEP if i else 0.0, gap=False)
+        named |= faulty(speeds.sensors)
     return named
 
 

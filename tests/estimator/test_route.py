@@ -45,7 +45,9 @@ class Rider:
 
     def __init__(self, route=None):
         vehicle = reference()
-        self.motion, self.signals = Motion(altitude=300.0), ShownSignals()
+        self.signals = ShownSignals()
+        self.motion = Motion(self.signals, 0.25, 1.0)
+        self.motion.altitude = 300.0
         self.forecaster = Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
         self.forecast = RouteForecaster(self.forecaster, self.motion, self.signals)
         self.now, self.route = 0.0, route

@@ -7,10 +7,12 @@ from math import exp
 
 import pytest
 
-from gz_onboard.estimator.plausibility.residual import CONFIG, RateLimit
+from gz_onboard.estimator.plausibility.limits import LimitCheck
+from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
 from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, flat_pack, follow, worst
+from tests.events import ShownSignals
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
 
@@ -96,17 +98,25 @@ def test_a_first_value_that_is_none_accuses_nobody():
     assert {role for _, row in rows for role in row.distrusted} == set()
 
 
+def shown(*values: float) -> list[bool]:
+    """Which of these temperatures of a motor are trusted, one each second."""
+    signals = ShownSignals("motor_temperature")
+    limits, trusted = LimitCheck(signals), []
+    for second, value in enumerate(values):
+        signals.show(float(second), {"motor_temperature": value})
+        limits.step(float(second), 1.0, None)
+        trusted.append(signals.motor_temperature.trusted)
+    return trusted
+
+
 def test_a_jump_of_a_settled_signal_is_refused():
-    limit = RateLimit()
-    assert all(limit.allows(1.0, 20.0, 0.1, 0.1, 2.0) for _ in range(round(CONFIG.settled_after_s) + 1))
-    assert not any(limit.allows(1.0, 60.0, 0.1, 0.1, 2.0) for _ in range(200))
-    assert limit.allows(1.0, 21.0, 0.1, 0.1, 2.0)
+    settled = [20.0] * (round(CONFIG.settled_s) + 1)
+    assert all(shown(*settled, 21.0, 60.0)[:-1])
+    assert not any(shown(*settled, *[210.0] * 60)[len(settled) :])
 
 
 def test_a_jump_from_a_start_up_value_is_accepted():
-    limit = RateLimit()
-    assert all(limit.allows(1.0, value, 0.1, 0.1, 2.0) for value in (0.0, *[30.0] * 40))
-    assert not limit.allows(1.0, 0.0, 0.1, 0.1, 2.0)
+    assert shown(0.0, *[50.0] * 40, 0.0) == [True] * 41 + [False]
 
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
