@@ -67,15 +67,20 @@ def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.bo
     while place < len(time_ns):
         if codec.started:
             end, last, _ = _follow(time_ns, place, last, AHEAD_NS)
-            origins[place:end] = codec._origin_ns or 0
+            origins[place:end] = _wrapped(codec._origin_ns or 0)
             place = end
         if place < len(time_ns):
             codec._last_ns = last
             kept[place] = codec._retime(int(time_ns[place]))
-            origins[place] = codec._origin_ns or 0
+            origins[place] = _wrapped(codec._origin_ns or 0)
             last, place = codec._last_ns, place + 1
     codec._last_ns = last
     return kept, time_ns - origins
+
+
+def _wrapped(origin_ns: int) -> int:
+    """`origin_ns` as an int64, which wraps around; so does the difference from a time, which is right again."""
+    return (origin_ns + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
 def _follow(time_ns: NDArray[np.int64], place: int, last: int, ahead_ns: int) -> tuple[int, int, int]:
