@@ -162,8 +162,10 @@ def _starts(content: bytes, damage: LogDamage, place: str) -> tuple[NDArray[np.i
 
 
 def _records(content: bytes, at: NDArray[np.int64], layout: np.dtype[Any]) -> NDArray[Any]:
-    """The records of one layout that begin at the bytes `at`, which may overlap."""
-    size = layout.itemsize
+    """The records of one layout that begin at the bytes `at`, which may overlap; mostly at even distances."""
+    size, steps = layout.itemsize, np.diff(at)
+    if len(steps) and (steps == steps[0]).all():
+        return np.ndarray(len(at), layout, content, int(at[0]), (int(steps[0]),))
     everywhere = np.ndarray((len(content) - size + 1,), f"V{size}", content, strides=(1,))
     return everywhere[at].view(layout)
 
@@ -177,9 +179,10 @@ def _frames(content: bytes, starts: NDArray[np.int64], start_ns: int, damage: Lo
     columns.time_ns[:] = start_ns + (np.minimum(objects["time"], LATEST_NS // unit) * unit).astype(np.int64)
     good = np.zeros(len(starts), bool)
     for kind, layout in _FRAMES.items():
-        at = np.flatnonzero((objects["kind"] == kind) & (objects["version"] >= 1) & (objects["version"] <= 2))
-        if not len(at):
+        chosen = (objects["kind"] == kind) & (objects["version"] >= 1) & (objects["version"] <= 2)
+        if not chosen.any():
             continue
+        at: Any = slice(None) if chosen.all() else np.flatnonzero(chosen)  # a slice is not copied
         body = _BODY_AT[objects["version"][at]]
         fields = _records(content, starts[at] + body, layout)
         data, length = fields["data"], fields["length"]
@@ -194,14 +197,15 @@ def _frames(content: bytes, starts: NDArray[np.int64], start_ns: int, damage: Lo
             length = np.where(remote, np.minimum(length, 8), length)
         else:  # a code of 9 to 15 means 8 bytes
             length = np.minimum(length, 8)
-        missing = np.arange(data.shape[1]) >= there[:, None]
+        if remote.any() or there.min() < data.shape[1]:
+            data = np.where((np.arange(data.shape[1]) >= there[:, None]) | remote[:, None], 0, data)
         columns.identifier[at] = fields["identifier"] & _IDENTIFIER | np.where(
             remote, RTR_FLAG, ERR_FLAG if kind == _ERROR_FRAME else 0
         ).astype(np.uint32)
         columns.channel[at] = (fields["channel"] - 1) & 0x7F | np.where(sent, TRANSMITTED, 0)
         columns.length[at] = length
-        columns.data[at, : data.shape[1]] = np.where(missing | remote[:, None], 0, data)
+        columns.data[at, : data.shape[1]] = data
         good[at] = (there >= length) | (kind == _FD_MESSAGE_64) & (there >= 0)
-        if broken := int(len(at) - good[at].sum()):
+        if broken := int((~good[at]).sum()):
             damage.add(place, f"a broken object of type {kind} in this container", broken)
     return columns if good.all() else columns[good]
