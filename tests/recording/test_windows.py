@@ -96,6 +96,7 @@ def assert_alike(mapping: BusMapping, frames: Sequence[tuple[int, Frame]]) -> St
     assert diagnoses[0] == diagnoses[1]
     received = [sorted(frame for frame in run.logged if not frame[3] & TRANSMITTED) for run in (log, live)]
     assert received[0] == received[1]
+    live.pipeline.codec.windows()  # counts the frames of the last window, which has not ended
     for name in COUNTED:
         assert getattr(log.pipeline.codec, name) == getattr(live.pipeline.codec, name), name
     return log
