@@ -19,7 +19,7 @@ from typing import Any
 RIDE = Path(__file__).resolve().parents[1] / "replay_logs" / "city_14C.blf"
 REPEATS = 3
 PARTS = {
-    "battery filter, a step": ("gz_onboard.estimator.soc", "StateOfCharge.step"),
+    "battery filter, a step": ("gz_onboard.estimator.battery_pack", "BatteryPack.step"),
     "sensor checks, a step": ("gz_onboard.estimator.plausibility", "Plausibility.step"),
     "forecast": ("gz_onboard.estimator.forecast", "Forecaster.forecast"),
 }

@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.real_cell import INTERVAL, MARK, NEAR, RIGHT_SD, WRONG
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as gz_onboard
+from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
@@ -71,8 +72,8 @@ def errors(work: tuple[Path, Path, str, float]) -> tuple[Array, Array, Array]:
             continue
         if not told:
             told = True
-            f.soc, f.v1, f.error = float(truth[k]) + wrong, 0.0, 0.0
-            f.covariance = max(abs(wrong), RIGHT_SD) ** 2, 0.0, f.covariance[2]
+            f = with_soc(f, float(truth[k]) + wrong, max(abs(wrong), RIGHT_SD) ** 2)._replace(v1=0.0, error=0.0)
+            estimator.pack.state = f
         found[:, k] = f.soc - truth[k], sqrt(f.covariance[0])
     known = np.isfinite(found[0])
     return found[0][known], found[1][known], truth[known]

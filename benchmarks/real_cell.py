@@ -10,7 +10,7 @@ filter is that of the on-board estimator, fed with events once a second; the dri
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from math import exp, nan
@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.estimator.ekf import Covariance, Noise, ScalarFilter, SocFilter
-from gz_onboard.estimator.uncertainty import UNCHECKED_SD
+from gz_onboard.estimator.battery_filter import with_soc
+from gz_onboard.estimator.battery_priors import PRIOR
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
@@ -78,7 +79,7 @@ def drawn(work: Sequence[Cycle], capacity: Found) -> dict[tuple[str, Cycle], Cas
     In the others the start, the count and the capacity are right, which no interval can know.
     """
     rng = np.random.default_rng(SEED)
-    unchecked = UNCHECKED_SD * capacity.value
+    unchecked = PRIOR.unchecked_rate_sd * capacity.value
     share = float(np.hypot(capacity.sd / capacity.value, SENSOR["pack_current_gain"][1]))
     found = {}
     for name, sd in DRAWN.items():
@@ -172,25 +173,24 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     )
 
 
-class Extended(ScalarFilter):
-    """The on-board filter with a second, slow pair that follows the current alone."""
+class TwoPairs(CellEffects):
+    """The effects in the cells with a second, slow RC pair that follows the current alone."""
 
-    slow_resistance: Mesh | None = None
-    slow_time: Mesh | None = None
+    slow_resistance: Mesh
+    slow_time: Mesh
     v2 = 0.0
 
-    def predict(self, dt: float, current: float, temperature: float, noise: Noise) -> None:
-        if self.slow_resistance and self.slow_time:
-            decay = exp(-dt / self.slow_time.at(self.soc, temperature)[0])
-            r2 = self.slow_resistance.at(self.soc, temperature)[0]
-            self.v2 = decay * self.v2 + (1 - decay) * r2 * current
-        super().predict(dt, current, temperature, noise)
+    def __bool__(self) -> bool:
+        return True
 
-    def innovation(self, voltage: float, current: float, temperature: float) -> tuple[float, float]:
-        return super().innovation(voltage + self.v2, current, temperature)
-
-    def update(self, voltage: float, current: float, temperature: float, variance: float) -> None:
-        super().update(voltage + self.v2, current, temperature, variance)
+    def step(
+        self, dt: float, current: float, soc: float, temperature: float, others: Mapping[str, float] | None = None
+    ) -> None:
+        super().step(dt, current, soc, temperature, others)
+        decay = exp(-dt / self.slow_time.at(soc, temperature)[0])
+        self.v2 = decay * self.v2 + (1 - decay) * self.slow_resistance.at(soc, temperature)[0] * current
+        self.overpotential += self.v2
+        self.mean_overpotential += self.v2
 
 
 @dataclass(frozen=True)
@@ -201,13 +201,6 @@ class Setting:
     battery: Battery
     result: Result
     slow: tuple[Mesh, Mesh] | None = None
-
-    def make(self, battery: Battery, soc: float, v1: float, covariance: Covariance) -> SocFilter:
-        if not self.slow:
-            return ScalarFilter(battery, soc, v1, covariance)
-        made = Extended(battery, soc, v1, covariance)
-        made.slow_resistance, made.slow_time = self.slow
-        return made
 
 
 @dataclass(frozen=True)
@@ -246,7 +239,10 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
     beside = {**result.effects, **({"slow_relaxation": False} if setting.slow else {})}
     model = Model(tuple(e for e in vehicle.model.effects if beside.get(e.name, True)), Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-    estimator = EventEstimator(groups, battery, model, vehicle.riding, setting.make)
+    estimator = EventEstimator(groups, battery, model, vehicle.riding)
+    if setting.slow:
+        estimator.pack.effects = effects = TwoPairs(model, estimator.battery)
+        effects.slow_resistance, effects.slow_time = setting.slow
     estimator.forecaster._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
     cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator._load
@@ -270,10 +266,11 @@ def run(setting: Setting, cycle: Cycle, case: Case) -> Score:
             continue
         if not told:
             told = True
-            f.soc, f.v1, f.error = float(truth[k]) + case.wrong, 0.0, 0.0
-            f.covariance = (case.sd**2, 0.0, f.covariance[2])
-            estimator.soc.ageing.part()
-        soc[k], sd[k] = estimator.soc.ageing.state_of_charge(f)
+            f = with_soc(f, float(truth[k]) + case.wrong, case.sd**2)._replace(v1=0.0, error=0.0)
+            f = f._replace(covariance=(f.covariance[0], 0.0, *f.covariance[2:]))
+            estimator.pack.state = f
+            estimator.pack.age.apply(f)
+        soc[k], sd[k] = estimator.pack.soc
     known = np.isfinite(soc)
     error, sd = (soc - truth)[known], sd[known]
     first = [np.flatnonzero(np.abs(error) < limit) for limit in (CONVERGED, NEAR)]

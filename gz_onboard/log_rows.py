@@ -7,8 +7,8 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
-from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.energy_counter import EnergyCounter
+from gz_onboard.estimator.pack_age import Learned
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
 

@@ -16,7 +16,7 @@ from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.estimator import signals
-from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
+from gz_onboard.estimator.battery_filter import SCALAR, Backend
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -54,15 +54,15 @@ FREE = (
 """Where range frames may begin, the first choice first: of 11 bits and low priority, not the diagnosis' above 0x700."""
 
 
-def filter_maker(name: str) -> FilterMaker:
-    """The backend of the SOC filter, of `FILTERS`; ``filterpy`` imports numpy and scipy. InputError for another."""
+def filter_backend(name: str) -> Backend:
+    """The backend of the battery filter, of `FILTERS`; ``filterpy`` imports numpy and scipy. InputError for another."""
     if name not in FILTERS:
         raise InputError(f"filter {name!r}: must be {' or '.join(FILTERS)}{nearest(name, FILTERS)}")
     if name == "scalar":
-        return ScalarFilter
-    from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+        return SCALAR
+    from gz_onboard.estimator.filterpy_reference import FILTERPY
 
-    return FilterpyFilter
+    return FILTERPY
 
 
 class Pipeline:
@@ -85,7 +85,7 @@ class Pipeline:
         self.vehicle = vehicle
         self.codec = Codec(vehicle.mapping)
         self.estimator = Estimator(
-            self.codec.groups, vehicle.pack, vehicle.model, vehicle.riding, filter_maker(filter_name)
+            self.codec.groups, vehicle.pack, vehicle.model, vehicle.riding, filter_backend(filter_name)
         )
         self.publisher = range_publisher(vehicle)
         self.kernel_lost = 0  # frames; set by the daemon
@@ -250,7 +250,7 @@ class Pipeline:
             "unknown": {hexadecimal(i): n for i, n in sorted(codec.unknown.items())[:32]},
             "reasons": reason_names(self.last.reasons) if self.last else [],
             "ride": self._ride(),
-            "learned": learned_row(self.estimator.soc.ageing.learned()),
+            "learned": learned_row(self.estimator.pack.learned()),
         }
 
     def _ride(self) -> dict[str, object]:

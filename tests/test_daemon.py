@@ -287,7 +287,7 @@ def learned() -> Snapshot:
 
 def is_fresh(daemon: Daemon) -> bool:
     ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
-    return ours.snapshot("") == new.snapshot("") is None and ours.motion == new.motion and ours.soc.saved is None
+    return ours.snapshot("") == new.snapshot("") is None and ours.motion == new.motion and ours.pack.past is None
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from gz_onboard import state
 from gz_onboard.cli import main
 from gz_onboard.errors import BAD_INPUT, OK
-from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.estimator.weakest import NAMES
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
@@ -29,11 +29,11 @@ def saved(tmp_path: Path) -> Path:
     """A state of a pack that has aged, an hour old."""
     vehicle = read_vehicle("reference")
     estimator = Pipeline(vehicle).estimator
-    learned = estimator.soc.ageing.snapshot()
-    learned["capacity"] |= {"inverse": 1 / CAPACITY, "variance": 0.01**2}
-    learned["resistance"] |= {"factor": RESISTANCE, "time": 1800.0}
-    estimator.soc.ageing.restore(learned)
-    estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
+    known = with_soc(estimator.pack.age.unknown, 0.6, 1e-4)
+    covariance = (*known.covariance[:4], 1e-4, 0.0, 0.0, 0.01**2, 0.0, 0.05**2)
+    known = known._replace(inverse_capacity=1 / CAPACITY, resistance=RESISTANCE, covariance=covariance)
+    estimator.pack.age.restart(known)
+    estimator.pack.state = known
     snapshot = estimator.snapshot(vehicle.key)
     assert snapshot
     file = tmp_path / "reference.json"
@@ -69,7 +69,7 @@ def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     price = replace(learner.habits.price, level=1.2, level_variance=0.01**2)
     learner.state = replace(learner.state, habits=learner.habits._replace(price=price))
     estimator.forecaster.ridden_by("anna")
-    estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
+    estimator.pack.state = with_soc(estimator.pack._believed, 0.6, 1e-4)
     changed = estimator.snapshot(vehicle.key)
     assert changed
     state.write(saved, state.encode(changed, time.time()))
@@ -108,7 +108,7 @@ def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, cap
     estimator = Pipeline(vehicle).estimator
     snapshot, _ = state.load(saved, time.time()) or ({}, None)
     estimator.restore(snapshot, vehicle.key, 0.0)
-    estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
+    estimator.pack.state = with_soc(estimator.pack._believed, 0.6, 1e-4)
     estimator.weakest.known = replace(estimator.weakest.known, means=(0.04, 1 / 0.9 - 1, 0.0, 0.0))
     changed = estimator.snapshot(vehicle.key)
     assert changed

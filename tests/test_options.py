@@ -9,7 +9,7 @@ import pytest
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
 from gz_onboard.options import LOG_SUFFIXES, add_shared, number
-from gz_onboard.pipeline import filter_maker
+from gz_onboard.pipeline import filter_backend
 from gz_onboard.recording import logs
 from tests.support import ROOT
 
@@ -56,7 +56,7 @@ def test_the_formats_of_logs_are_those_that_can_be_read():
 
 def test_a_filter_that_there_is_not_is_refused():
     with pytest.raises(InputError, match=r"filter 'scaler': must be scalar or filterpy \(did you mean 'scalar'"):
-        filter_maker("scaler")
+        filter_backend("scaler")
 
 
 def test_an_option_has_one_meaning():

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.ekf import Noise, ScalarFilter
-from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
-from gz_onboard.estimator.uncertainty import VoltageUncertainty
+from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.events import Group
 from gz_onboard.offline.series import ocv_over
 from gz_onboard.physics.battery import Battery
@@ -95,18 +93,20 @@ def test_without_the_table_the_same_bits(soc, temperature, power):
     assert flat.settled_current(power, soc, temperature) == PLAIN.settled_current(power, soc, temperature)
 
 
-@pytest.mark.parametrize("backend", [ScalarFilter, FilterpyFilter])
-def test_the_filter_reckons_with_it(backend):
+def test_the_filter_reckons_with_it():
     """A cold cell that rests 20 mV lower: told so, the filter stays where it is right; not told, it is drawn away."""
     soc = {}
+    groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     for battery in (COLD, PLAIN):
-        f = backend(battery, 0.6, 0.0, (0.05**2, 0.0, 1e-6))
-        volts = COLD.ocv(0.6, 0.0)[0]
-        for _ in range(200):
-            f.predict(1.0, 0.0, 0.0, Noise(1e-9, 1e-6, 100.0))
-            f.update(volts, 0.0, 0.0, 0.01**2)
-        soc[battery is COLD] = f.soc
-    assert soc[True] == pytest.approx(0.6, abs=1e-6)
+        estimator = EventEstimator(groups, battery, VEHICLE.model, VEHICLE.riding)
+        offset = VEHICLE.parameters["pack_voltage_offset"], VEHICLE.parameters["pack_current_offset"]
+        volts = 14 * COLD.ocv(0.6, 0.0)[0] + offset[0]
+        for k in range(300):
+            estimator.handle((float(k), 0, (0.0,)))
+            estimator.handle((k + 0.1, 1, (volts, offset[1])))
+        assert estimator.filter
+        soc[battery is COLD] = estimator.filter.soc
+    assert soc[True] == pytest.approx(0.6, abs=1e-3)
     assert soc[False] < 0.6 - 0.5 * 0.02 / COLD.ocv(0.6)[1]
 
 
@@ -122,7 +122,7 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
         assert estimator.filter
         expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
         assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)
-        sd[battery is COLD] = estimator.soc.uncertainty.rest
+        sd[battery is COLD] = estimator.pack.voltage_noise.rest
     assert sd[True] > 1.01 * sd[False]
 
 
@@ -188,10 +188,11 @@ sd_relative = 0.2
 def test_for_how_long_it_errs_the_same_way_is_read_over_temperature(tmp_path):
     battery = read(tmp_path, TIMES)
     usual = VEHICLE.parameters["cell_voltage_error_time"]
-    over, plain = (VoltageUncertainty(b, VEHICLE.parameters) for b in (battery, PLAIN))
+    over, plain = (VoltageNoise(b, VEHICLE.parameters) for b in (battery, PLAIN))
     assert [over.error_time(t) for t in (-20.0, 7.5, 40.0)] == pytest.approx([1000.0, 580.0, 160.0])
     assert plain.error_time(-20.0) == plain.error_time(40.0) == usual
-    cold, warm = (over.slow(0.6, t, 0.2**2).time for t in (-10.0, 25.0))  # before anything is known of the charge
+    slope = battery.ocv(0.6)[1]
+    cold, warm = (over.slow(0.6, slope, t, 0.2**2)[1] for t in (-10.0, 25.0))  # before anything is known of the charge
     assert cold == pytest.approx(1000.0, rel=0.01)
     assert 160.0 < warm < 0.2 * cold
     with pytest.raises(InputError, match=r"voltage_error_time.*outside 10 to 36000"):

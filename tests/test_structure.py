@@ -48,7 +48,7 @@ FORBIDDEN = {
 OFFLINE = ("recording", "offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
 # Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
-ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py", "bridges/broker.py"}
+ON_REQUEST = {"estimator/filterpy_reference.py", "arrays.py", "bridges/broker.py"}
 
 # The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
 # that stand before it.
@@ -225,7 +225,7 @@ def test_the_checks_see_what_they_look_for():
     source = """
 import gz_onboard.lab
 from .. import daemon
-from gz_onboard.estimator import ekf
+from gz_onboard.estimator import signals
 if TYPE_CHECKING:
     import pandas
 try:
@@ -237,6 +237,6 @@ def later():
 """
     tree = ast.parse(source)
     found = set(imports(ast.walk(tree), Path("bus/codec.py")))
-    assert {"gz_onboard.lab", "gz_onboard.daemon", "gz_onboard.estimator.ekf", "matplotlib", "pandas"} <= found
+    assert {"gz_onboard.lab", "gz_onboard.daemon", "gz_onboard.estimator.signals", "matplotlib", "pandas"} <= found
     assert HEAVY & set(imports(at_import_time(tree.body), Path("bus/codec.py"))) == {"scipy"}
     assert "numpy.linalg" in set(imports(at_import_time(tree.body), Path("bus/codec.py")))

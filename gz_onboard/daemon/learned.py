@@ -16,9 +16,9 @@ from typing import Any
 
 from gz_onboard import state
 from gz_onboard.errors import OK, InputError, not_an_input, writing
-from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.consumption import Habits
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.pack_age import Learned
 from gz_onboard.estimator.snapshot import check_vehicle
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
@@ -115,7 +115,7 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
 
 def battery_learned(estimator: Estimator) -> dict[str, Learned]:
     """Return the learned battery, by name; the weakest group only if its voltage is on the bus."""
-    return estimator.soc.ageing.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
+    return estimator.pack.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
 
 
 def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:

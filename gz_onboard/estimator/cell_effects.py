@@ -69,17 +69,12 @@ class CellEffects:
             after[name] = effect.step(states[name], dt, quantities)
         return after
 
-    def read(self, saved: Mapping[str, float]) -> dict[str, float]:
-        """Saved states, which were checked. ValueError if they are not of these effects."""
+    def restore(self, saved: Mapping[str, float], age: float | None, soc: float) -> None:
+        """Continue from the `saved` states after a rest of `age` [s], None: long. ValueError for other effects."""
         if saved.keys() != self.states.keys():
             raise ValueError("is damaged: state.cell_effects has not the effects of this vehicle")
-        return dict(saved)
-
-    def restore(self, states: dict[str, float], age: float | None, soc: float) -> None:
-        """At rest meanwhile; for how long [s] if that is not known: for long."""
-        if states:
-            self.states = states
-            self.rest(FOREVER if age is None else age, soc)
+        self.states = dict(saved)
+        self.rest(FOREVER if age is None else age, soc)
 
     def rest(self, seconds: float, soc: float) -> None:
         """So much time [s] without a load, at a temperature that is not known."""

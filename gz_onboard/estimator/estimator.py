@@ -3,16 +3,17 @@
 No I/O and no clock: time arrives with the windows, so the same windows give the same estimates, to the last bit.
 All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
 check the sensors and choose the pack's voltage and current (`plausibility`), follow the motion (`motion`), choose the
-temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
+temperatures, step the battery filter (`battery_pack`), learn from the riding and forecast (`forecaster`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf
+from math import inf, sqrt
 from typing import Any
 
-from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
+from gz_onboard.estimator.battery_filter import SCALAR, Backend, FilterState
+from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import PresentLoad
@@ -21,9 +22,7 @@ from gz_onboard.estimator.plausibility import Plausibility
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.snapshot import VERSION, check_snapshot
-from gz_onboard.estimator.soc import StateOfCharge
-from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState
-from gz_onboard.estimator.start import read_saved
+from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
@@ -62,12 +61,7 @@ class Estimator:
     """The estimator of one vehicle."""
 
     def __init__(
-        self,
-        groups: Sequence[Group],
-        battery: Battery,
-        model: Model,
-        riding: PriorRiding,
-        make: FilterMaker = ScalarFilter,
+        self, groups: Sequence[Group], battery: Battery, model: Model, riding: PriorRiding, backend: Backend = SCALAR
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
         self.forecaster = Forecaster(model, battery, riding)
@@ -89,16 +83,16 @@ class Estimator:
         models = self._cell_error, self._road_power, self._level_power
         self.plausibility = Plausibility(self.signals, battery, p, model.mass, *models)
         self._temperatures = Temperatures(self.signals, p)
-        self.soc = StateOfCharge(battery, model, make, self.signals, self.plausibility.pack.sag)
-        self.forecaster.ageing, self.weakest = self.soc.ageing, WeakestGroup(battery, self.signals, p)
+        self.pack = BatteryPack(battery, model, backend, self.signals, self.plausibility.pack.sag)
+        self.forecaster.pack, self.weakest = self.pack, WeakestGroup(battery, self.signals, p)
         self._load = PresentLoad(
-            self.forecaster.load, self.motion, self._temperatures, self.soc, self._vibration, self.signals
+            self.forecaster.load, self.motion, self._temperatures, self.pack, self._vibration, self.signals
         )
 
     @property
-    def filter(self) -> SocFilter | None:
-        """The filter of the state of charge; None before the start."""
-        return self.soc.filter
+    def filter(self) -> FilterState | None:
+        """State of the battery filter; None before the first voltage."""
+        return self.pack.state
 
     def vibration(self, now: float) -> float:
         """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
@@ -133,16 +127,16 @@ class Estimator:
         motion.step(now, elapsed)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed, gap=elapsed < dt)
-        temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self.signals.pause else at_rest)
-        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
-        self.soc.step(now, dt, PackState(self._reading, temperature, motion.speed), self._load)
-        self.weakest.step(now, self._reading, temperature, self.soc)
+        temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= self.signals.pause else at_rest)
+        self.pack.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
+        self.pack.step(now, dt, self._reading, temperature, motion.speed, self._load)
+        self.weakest.step(now, self._reading, temperature, self.pack)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         if self.filter is None:
             self.forecaster.outdate()
         elif self.forecaster.due(now):
-            self._look_ahead(now, self.filter, temperature)
+            self._look_ahead(now, temperature)
 
     def _elapsed(self, now: float) -> float | None:
         """The time since the last step [s], less what the clock was set by; None until the odometer shows which it was.
@@ -168,20 +162,19 @@ class Estimator:
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """What the pack gives by the sensors, else by the model."""
-        reading = self.plausibility.pack.read(now, dt, self.motion.speed, self.soc.gate.rms)
-        self.soc.doubt(now, reading.voltage_doubted)
+        reading = self.plausibility.pack.read(now, dt, self.motion.speed, sqrt(self.pack.test.square))
+        self.pack.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
         rides = speed is not None and abs(speed) > MOVING and dt < self.signals.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
-            voltage = reading.voltage or self.soc.rest_voltage
+            voltage = reading.voltage or self.pack.rest_voltage
             return reading._replace(current=self._load.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _cell_error(self, voltage: float, current: float, sensor: str) -> float:
         """What the sensor checks compare with, as the next two."""
-        cells = self._temperatures.cells_or_bench
-        return self.soc.cell_error(self._time or 0.0, (voltage, current), sensor, cells) or 0.0
+        return self.pack.cell_error(self._time or 0.0, (voltage, current), sensor) or 0.0
 
     def _road_power(self) -> float | None:
         known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
@@ -211,7 +204,7 @@ class Estimator:
         if "auxiliary_current" in newly:
             self.forecaster.learner.auxiliaries.forget()
         if newly & AGED_FROM:
-            self.soc.ageing.unlearn()
+            self.pack.unlearn()
 
     # --- riding and range -------------------------------------------------------------------------------------
 
@@ -265,12 +258,12 @@ class Estimator:
         auxiliaries = self.forecaster.learner.auxiliaries
         return power - auxiliaries.modelled - auxiliaries.now
 
-    def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
+    def _look_ahead(self, now: float, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
         missing = self._reasons(now) | int(self.signals.lacking)
         lost = sum([variance for reason, variance in _LOSS_VARIANCES if reason & missing])
         conditions = self._load.conditions(now)
-        soc = self.soc.ageing.state_of_charge(filter_)
+        soc = self.pack.soc
         activity, way = self._activity.now, (self.motion.distance, self.route.hills)
         forecast = self.forecaster.step(
             *(now, soc, cells, conditions, lost, self._reading, activity),
@@ -286,18 +279,18 @@ class Estimator:
         reasons = self._reasons(now)
         estimate = Estimate(time=now, reasons=Reason(reasons), distrusted=self._distrusted, distance=motion.distance)
         silent = self._time is None or now - self._time > max(SILENT_AFTER, self.signals.pause)
-        estimate.activity = self._activity.shown(silent, self.soc.joined)
+        estimate.activity = self._activity.shown(silent, self.pack.joined)
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = motion.speed, motion.acceleration, motion.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = motion.lean, motion.yaw_rate, motion.heading
             self._reading.report(estimate)
-            estimate.innovation = self.soc.gate.innovation
+            estimate.innovation = self.pack.test.innovation
         estimate.cell_temperature = self._temperatures.cells
         if filter_ is None:
             estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
             return estimate
-        estimate.soc, estimate.soc_sd = self.battery.window.shown(*self.soc.ageing.state_of_charge(filter_))
-        estimate.v1, estimate.innovation_rms = filter_.v1, self.soc.gate.rms
+        estimate.soc, estimate.soc_sd = self.battery.window.shown(*self.pack.soc)
+        estimate.v1, estimate.innovation_rms = filter_.v1, sqrt(self.pack.test.square)
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self.forecaster.report(estimate)
@@ -316,11 +309,11 @@ class Estimator:
         if self.plausibility.pack.current_difference.contradicts:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.plausibility.pack.voltage_dispute or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
-        if differ or self.soc.gate.mismatch:
+        if differ or self.pack.test.mismatch:
             reasons |= Reason.VOLTAGE_MISMATCH
         if self.signals.sampled > TIMING.slowest:
             reasons |= Reason.SIGNALS_SLOW
-        if self.soc.restarted(now):
+        if self.pack.restarted(now):
             reasons |= Reason.SOC_RESTARTED
         if self._distrusted:
             reasons |= Reason.SENSOR_DISTRUSTED
@@ -332,7 +325,7 @@ class Estimator:
         """What is to be kept over a restart, for the vehicle `key`; None while there is nothing to keep."""
         if self.filter is None:
             return None
-        return self.soc.snapshot(self.filter) | {
+        return self.pack.snapshot() | {
             "version": VERSION,
             "key": key,
             "consumption": self.forecaster.consumption,
@@ -344,11 +337,11 @@ class Estimator:
 
     def learned_snapshot(self) -> dict[str, Any]:
         """What was learned of the pack's age, as part of the saved state."""
-        return {**self.soc.ageing.snapshot(), "weakest": self.weakest.snapshot()}
+        return {**self.pack.learned_snapshot(), "weakest": self.weakest.snapshot()}
 
     def wait(self, seconds: float) -> None:
         """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
-        self.soc.wait(seconds)
+        self.pack.wait(seconds)
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Continue from a snapshot that is `age` [s] old (None: not known).
@@ -358,11 +351,10 @@ class Estimator:
         check_snapshot(saved, key)
         age = age if age is not None and 0 <= age < inf else None  # a clock that was set tells no age
         self.forecaster.restore(saved["riding"])
-        self.soc.ageing.restore(saved["learned"])
         self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))
         bias_x, bias_z = saved["gyro_bias"]
         self.motion.gyro_bias = bias_x, bias_z
         if saved["cell_temperature"] is not None and age is not None and age < CELLS_KEEP:
             self._temperatures.cells = saved["cell_temperature"]
-        self.soc.restore(read_saved(saved), age, self.soc.effects.read(saved["cell_effects"]))
+        self.pack.restore(saved, age)
         self.forecaster.learner.pause(NEW_DAY if age is None else age)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from gz_onboard.constants import DECILE, HOUR
 from gz_onboard.estimator import consumption
-from gz_onboard.estimator.ageing import Ageing
+from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.consumption import CONSUMPTION, ConsumptionLearner
 from gz_onboard.estimator.load_model import AHEAD, Conditions
 from gz_onboard.estimator.motion import MOTION
@@ -222,7 +222,7 @@ class Forecaster:
         self.load = self.learner.load
         self.battery = battery
         self.smoother = RangeSmoother()
-        self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
+        self.pack: BatteryPack | None = None  # None: the pack is known to be as its file says
         self.cooling = pack_constants(model.parameters)
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         p = model.parameters
@@ -279,7 +279,7 @@ class Forecaster:
             + (self._cutoff_sd**2 + max(self._empty_sd, left.end_drop_sd) ** 2) * left.by_cutoff**2
         )
         fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
-        of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (fresh, fresh)
+        of_pack = self.pack.energy_sd(left.energy, left.slope, soc_sd) if self.pack else (fresh, fresh)
         down, up = (sqrt(of_end + sd * sd) for sd in of_pack)
         variance = min(loss_variance + expected.variance, FORECAST.most_sd**2)
         p10, p90 = deciles(left.energy, down, up, variance)

@@ -24,9 +24,9 @@ from gz_onboard.physics.model import Model, Recall, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
 
 if TYPE_CHECKING:
+    from gz_onboard.estimator.battery_pack import BatteryPack
     from gz_onboard.estimator.motion import Motion, VibrationMonitor
     from gz_onboard.estimator.signals import Signals
-    from gz_onboard.estimator.soc import StateOfCharge
     from gz_onboard.estimator.temperatures import Temperatures
 
 Quantities = dict[str, float]
@@ -182,13 +182,13 @@ class PresentLoad:
         load: LoadModel,
         motion: Motion,
         temperatures: Temperatures,
-        soc: StateOfCharge,
+        pack: BatteryPack,
         monitor: VibrationMonitor | None,
         signals: Signals,
     ) -> None:
         """monitor: for a model that reads the vibration."""
         self._load, self._motion, self._temperatures = load, motion, temperatures
-        self._soc, self._monitor, self._motor_temperature = soc, monitor, signals.motor_temperature
+        self._pack, self._monitor, self._motor_temperature = pack, monitor, signals.motor_temperature
 
     def conditions(self, now: float) -> Conditions:
         """Conditions of the riding, as far as they are known."""
@@ -196,7 +196,7 @@ class PresentLoad:
         ambient, altitude = self._temperatures.ambient(now), motion.altitude or 0.0
         if not self._load.extended:
             return Conditions(ambient, altitude, WARM_MOTOR if motor is None else motor)
-        filter_, turning = self._soc.filter, motion.yaw_rate is not None and motion.speed is not None
+        state, turning = self._pack.state, motion.yaw_rate is not None and motion.speed is not None
         return Conditions(
             ambient,
             altitude,
@@ -204,9 +204,9 @@ class PresentLoad:
             (motion.speed or 0.0) * (motion.yaw_rate or 0.0) if turning else None,
             motion.heading,
             self._monitor.value(now) if self._monitor else None,
-            filter_.soc if filter_ else HALF_FULL,
+            state.soc if state else HALF_FULL,
             self._temperatures.cells_or_bench,
-            self._soc.current or 0.0,
+            self._pack.current or 0.0,
         )
 
     def power(self, now: float) -> float:

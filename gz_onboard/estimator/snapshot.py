@@ -6,21 +6,19 @@ from collections.abc import Mapping
 from typing import Any
 
 from gz_onboard.errors import shown
-from gz_onboard.estimator import ageing, forecast, start, weakest
-from gz_onboard.estimator.cell_effects import LARGEST
+from gz_onboard.estimator import battery_pack, forecast, pack_age, weakest
 from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.saved_fields import Each, Number, check
 
-VERSION = 6
+VERSION = 7
 """Raised with every change of a field; a state of another version is not read."""
 
 FIELDS: Mapping[str, Any] = {
-    **start.FIELDS,
-    "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
+    **battery_pack.FIELDS,
     "cell_temperature": Number(-50.0, 120.0, optional=True),  # degC
     "gyro_bias": Each(Number(-MOTION.max_gyro_bias, MOTION.max_gyro_bias), 2),  # rad/s, of roll and yaw rate
     "riding": forecast.FIELDS,
-    "learned": {**ageing.FIELDS, "weakest": weakest.FIELDS},
+    "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
 }
 
 

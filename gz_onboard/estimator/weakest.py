@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 from math import hypot, inf, isfinite, sqrt
 from typing import Any
 
-from gz_onboard.estimator.ageing import SAME, Learned
+from gz_onboard.estimator.battery_pack import BatteryPack
+from gz_onboard.estimator.pack_age import SAME, Learned
 from gz_onboard.estimator.saved_fields import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.parameters import Parameters
@@ -196,12 +196,12 @@ class WeakestGroup:
 
     # --- learning ---------------------------------------------------------------------------------------------
 
-    def step(self, now: float, reading: PackReading, temperature: float, soc: StateOfCharge) -> None:
+    def step(self, now: float, reading: PackReading, temperature: float, pack: BatteryPack) -> None:
         """Take in the window that ends at `now` [s]; temperature: of the cells [degC]."""
-        if soc.another_pack:
+        if pack.another_pack:
             self._begin_anew()
             self._battery.weaken(None)
-        if not self.mapped or reading.voltage is None or reading.current is None or soc.filter is None:
+        if not self.mapped or reading.voltage is None or reading.current is None or pack.state is None:
             return
         battery, signals = self._battery, self._signals
         is_new, self._seen_at = self._signal.time > self._seen_at, self._signal.time
@@ -212,13 +212,13 @@ class WeakestGroup:
         sound = sound and signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
         if not is_new or not sound or now - self._steady_since < CONFIG.steady_s:
             return
-        place, sd = soc.ageing.state_of_charge(soc.filter)
+        place, sd = pack.soc
         current = reading.current / battery.cells_parallel
         if sd > CONFIG.max_soc_sd or current < 0:  # while charging the lowest is another group
             return
         if not -CONFIG.block < self._block.began - place < CONFIG.place:  # the first, after a charge, or a new SOC
             self._block = VoltageBlock(place)
-        drop = battery.r0.at(place, temperature)[0] * current + soc.effects.overpotential + soc.filter.v1
+        drop = battery.r0.at(place, temperature)[0] * current + pack.effects.overpotential + pack.state.v1
         self._block.add(self._signal.value, mean, drop)
         if self._block.began - place >= CONFIG.block and self._block.count >= CONFIG.min_samples:
             block, self._block = self._block, VoltageBlock(place)

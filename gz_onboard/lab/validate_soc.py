@@ -15,7 +15,7 @@ from typing import Annotated
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import MILD
-from gz_onboard.estimator.uncertainty import VoltageUncertainty
+from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.physics.battery import discharged
 from gz_onboard.vehicle import Vehicle
 
@@ -48,7 +48,7 @@ def soc_reference(
     battery, p, counted = vehicle.pack, vehicle.parameters, measured["soc"]
     celsius = measured.get("cell_temperature")
     first, last = (None, None) if celsius is None else (float(celsius[0]), float(celsius[-1]))
-    voltage = VoltageUncertainty(battery, p)
+    voltage = VoltageNoise(battery, p)
     sensor = p.sd("pack_voltage_offset") / battery.cells_series
     drawn = start - float(counted[-1])
     relative = hypot(p.sd("cell_capacity") / p["cell_capacity"], p.sd("pack_current_gain"))

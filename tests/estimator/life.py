@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.events import Group
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import Event, EventEstimator
@@ -124,11 +125,21 @@ def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[floa
     return rows
 
 
+def set_soc(e: Any, soc: float, variance: float, error_variance: float) -> None:
+    """Set the state of charge and the variances of it and of the model error [V²]."""
+    state = with_soc(e.filter, soc, variance)
+    covariance = (variance, 0.0, 0.0, 0.0, error_variance, 0.0, 0.0, *state.covariance[7:])
+    e.pack.state = state._replace(covariance=covariance)
+    e.pack.age.apply(e.pack.state)
+
+
 def knows(e: Any, scooter: Scooter) -> None:
     """Tell it the true state of charge and capacity: what it says from then on is by what it has counted."""
-    e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
-    e.soc.ageing.inverse, e.soc.ageing.variance = 1.0, 1e-6
-    e.soc.ageing.part()
+    set_soc(e, scooter.soc, 1e-8, 1e-8)
+    state = e.filter
+    covariance = (*state.covariance[:7], 1e-6, *state.covariance[8:])
+    e.pack.state = state._replace(inverse_capacity=1.0, covariance=covariance)
+    e.pack.age.apply(e.pack.state)
 
 
 def worst(rows: list[tuple[float, Any]]) -> float:

@@ -94,13 +94,13 @@ def bursts(seconds):
 
 def test_steps_of_the_current_leave_no_error_and_the_sag_that_there_is(monkeypatch):
     e = EventEstimator(GROUPS, PACK, MODEL, VEHICLE.riding)
-    errors, cell_error = [], e.soc.cell_error
+    errors, cell_error = [], e.pack.cell_error
 
     def kept(*arguments):
         errors.append(cell_error(*arguments))
         return errors[-1]
 
-    monkeypatch.setattr(e.soc, "cell_error", kept)
+    monkeypatch.setattr(e.pack, "cell_error", kept)
     for event in bursts(120.0):
         e.handle(event)
     late = np.array([x for x in errors if x is not None][60:])

@@ -9,7 +9,8 @@ from math import exp
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+from gz_onboard.estimator.battery_filter import with_soc
+from gz_onboard.estimator.filterpy_reference import FILTERPY
 from gz_onboard.events import Group, Reason, State
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
@@ -109,15 +110,14 @@ def test_finds_back_from_a_wrong_start():
     plant = Plant(soc=0.7, offset=0.0)
     estimator, _ = run(plant, 2)
     assert estimator.filter
-    estimator.filter.soc -= 0.2
-    estimator.filter.covariance = (0.1**2, 0.0, 1e-4)
+    estimator.pack.state = with_soc(estimator.filter, estimator.filter.soc - 0.2, 0.1**2)
     _, rows = run(plant, 1800, estimator, begin=2.0)
     assert abs(rows[-1][1].soc - rows[-1][0]) < 0.05
 
 
 def test_both_backends_estimate_the_same():
     _, a = run(Plant(), 200)
-    _, b = run(Plant(), 200, EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding, FilterpyFilter))
+    _, b = run(Plant(), 200, EventEstimator(GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding, FILTERPY))
     for (_, x), (_, y) in zip(a, b, strict=True):
         assert x.soc == pytest.approx(y.soc, abs=1e-9)
         assert x.range == pytest.approx(y.range, abs=1e-3)
@@ -219,8 +219,8 @@ def test_charged_meanwhile_the_voltage_is_believed():
         ({"version": 99}, "version"),
         ({"key": "other"}, "other"),
         ({"soc": 7.0}, "not from 0 to 1"),
-        ({"covariance": [1e-4, 1.0, 1e-4]}, "impossible"),
-        ({"covariance": None}, "damaged"),
+        ({"soc_variance": 2e-9}, "impossible"),
+        ({"soc_variance": None}, "damaged"),
         ({"riding": {}}, "damaged"),
         ({"soc": float("nan")}, "state.soc is nan"),
     ],

@@ -108,7 +108,7 @@ def test_a_second_rc_pair_is_taken_out_of_the_innovation_and_of_the_soc():
         assert found.soc is not None
         results[name] = abs(found.innovation), abs(found.soc - soc)
         if name == "slow":
-            assert e.soc.effects.overpotential == pytest.approx(slow, rel=0.02)
+            assert e.pack.effects.overpotential == pytest.approx(slow, rel=0.02)
     assert results["slow"][0] < 0.003
     assert results["base"][0] > 10 * results["slow"][0]
     assert results["slow"][1] < 0.002
@@ -118,17 +118,17 @@ def test_the_states_outlive_a_restart_and_relax_meanwhile():
     vehicle = extended("slow_relaxation", "ocv_hysteresis", slow_time=600.0, hysteresis_rate=300.0)
     first, _ = run(vehicle, 300)
     saved = json.loads(json.dumps(first.snapshot(vehicle.key)))
-    before = dict(first.soc.effects.states)
+    before = dict(first.pack.effects.states)
     assert before["slow_relaxation"] > 1e-3
     assert before["ocv_hysteresis"] > 1e-3
     for age, share in ((0.0, 1.0), (600.0, math.exp(-1)), (None, 0.0)):
         second = estimator(vehicle)
         second.restore(saved, vehicle.key, age)
-        assert second.soc.effects.states["slow_relaxation"] == pytest.approx(
+        assert second.pack.effects.states["slow_relaxation"] == pytest.approx(
             share * before["slow_relaxation"], abs=1e-9
         )
-        assert second.soc.effects.states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
-        assert second.soc.effects.overpotential == pytest.approx(sum(second.soc.effects.states.values()))
+        assert second.pack.effects.states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
+        assert second.pack.effects.overpotential == pytest.approx(sum(second.pack.effects.states.values()))
 
 
 @pytest.mark.parametrize(

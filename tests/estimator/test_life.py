@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from gz_onboard.estimator.battery_priors import soc_from_voltage
 from gz_onboard.estimator.motion import MOTION
-from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
     BATTERY,
@@ -25,6 +25,7 @@ from tests.estimator.life import (
     flat_pack,
     follow,
     knows,
+    set_soc,
     worst,
 )
 
@@ -175,11 +176,13 @@ def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
 def test_a_voltage_overrules_a_capacity_that_was_learned_and_is_wrong(learned, true):
     """As of a pack replaced by one that differs in nothing else: what is believed does not outlast the curve."""
     scooter, e = Scooter(soc=0.95, capacity=true * BATTERY.pack_capacity(25.0), period=0.5, offset=0.0), estimator()
-    e.soc.ageing.inverse, e.soc.ageing.variance = 1 / learned, 0.01**2
+    known = e.pack.age.unknown
+    covariance = (*known.covariance[:7], 0.01**2, *known.covariance[8:])
+    e.pack._believed = known._replace(inverse_capacity=1 / learned, covariance=covariance)
     follow(e, scooter.live(30), scooter)
     while scooter.soc > 0.35:
         rows = follow(e, scooter.live(60, 9.0), scooter)
-    found = e.soc.ageing.capacity
+    found = e.pack.learned()["capacity"]
     assert abs(found.value - true) < 3 * found.sd < 0.25  # else it is 1 ± 0.01 to the end of the ride
     assert worst(rows) < 3
 
@@ -251,7 +254,7 @@ def test_an_inverter_that_is_being_charged_is_no_empty_pack(time_constant):
 def test_a_filter_that_is_contradicted_for_a_minute_begins_anew_and_says_so():
     scooter, e = Scooter(soc=0.8), estimator()
     follow(e, scooter.live(30), scooter)
-    e.filter.soc, e.filter.covariance = 0.1, (0.005**2, 0.0, 1e-6)
+    set_soc(e, 0.1, 0.005**2, 1e-6)
     rows = follow(e, scooter.live(300, 8.0), scooter)
     true, end = rows[-1]
     assert end.reasons & Reason.SOC_RESTARTED
@@ -539,10 +542,10 @@ def test_an_age_that_is_none_is_not_known(age):
 
 @pytest.mark.parametrize("temperature", [-20.0, -10.0])
 @pytest.mark.parametrize("volts", [2.4, 2.8, 3.1])
-def test_a_covariance_of_the_first_state_of_charge_can_exist(temperature, volts):
-    soc, (p00, p01, p11) = from_voltage(BATTERY, volts, 2.0, temperature, 0.8, 0.8, 0.05)
-    assert p01 * p01 <= p00 * p11
+def test_a_first_state_of_charge_is_within_the_table(temperature, volts):
+    soc, sd = soc_from_voltage(BATTERY, volts, 2.0, temperature, 0.8, 0.8)
     assert -0.02 <= soc <= 1.02
+    assert 0 < sd <= 0.5
 
 
 def test_a_sensor_that_twitches_at_standstill_is_no_motion():
@@ -615,7 +618,8 @@ def test_a_state_of_charge_begun_anew_ends_what_was_held_back_of_the_range():
     smoother.gap = 4000.0
     follow(e, scooter.live(1, 10.0), scooter)
     assert smoother.gap > 3000
-    e.filter.soc = scooter.soc = 0.3
+    scooter.soc = 0.3
+    e.pack.state = e.filter._replace(soc=0.3)
     follow(e, scooter.live(2, 10.0), scooter)
     assert abs(smoother.gap) < 300
 

@@ -6,21 +6,21 @@ from dataclasses import replace
 
 import pytest
 
-from gz_onboard.estimator.gate import CONTRADICTED, GATE_COUNT, InnovationGate
-from gz_onboard.estimator.initial import STEADY_AFTER, STEADY_TIME, STEADY_WAIT, SteadyVoltage
+from gz_onboard.estimator.battery_pack import PACK, InnovationTest
+from gz_onboard.estimator.battery_priors import PRIOR, ChargeNoise, VoltageNoise
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
-from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, HISTORY_TIME, ChargeUncertainty, VoltageUncertainty
-from gz_onboard.events import ROLES, Reason
+from gz_onboard.events import ROLES, WINDOW, Group, Reason
 from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
-from tests.events import ShownSignals
+from tests.events import EventEstimator, ShownSignals
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
 SLOW = 1e-4  # V²
 LOAD = 0.005**2  # V²
+RESTARTED = 0.35**2  # V²
 
 
 def everything(now: float = 0.0) -> Signals:
@@ -30,32 +30,32 @@ def everything(now: float = 0.0) -> Signals:
 
 
 def test_a_glitch_is_not_used_and_what_persists_is():
-    gate = InnovationGate()
-    assert gate.update(0.1, 0.01, 0.0, SLOW, LOAD) == pytest.approx(LOAD)
-    used = [gate.update(0.1, 0.3, 0.0, SLOW, LOAD) is not None for _ in range(GATE_COUNT)]
-    assert used == [False] * (GATE_COUNT - 1) + [True]
+    gate = InnovationTest()
+    assert gate.noise(0.1, 0.01, 0.0, SLOW, LOAD, RESTARTED) == pytest.approx(LOAD)
+    used = [gate.noise(0.1, 0.3, 0.0, SLOW, LOAD, RESTARTED) is not None for _ in range(PACK.glitch_count)]
+    assert used == [False] * (PACK.glitch_count - 1) + [True]
     assert gate.mismatch
-    assert not gate.refuted
+    assert gate.contradicted < PACK.contradicted_s
 
 
 def test_a_voltage_that_is_off_for_long_refutes_the_state():
-    gate = InnovationGate()
-    for _ in range(round(CONTRADICTED) - 1):
-        gate.update(1.0, 0.3, 0.0, SLOW, LOAD)
-    assert not gate.refuted
-    assert gate.update(1.0, 0.3, 0.0, SLOW, LOAD) is None
-    assert gate.refuted
+    gate = InnovationTest()
+    for _ in range(round(PACK.contradicted_s) - 1):
+        gate.noise(1.0, 0.3, 0.0, SLOW, LOAD, RESTARTED)
+    assert gate.contradicted < PACK.contradicted_s
+    gate.noise(1.0, 0.3, 0.0, SLOW, LOAD, RESTARTED)
+    assert gate.contradicted >= PACK.contradicted_s
 
 
 def test_a_model_that_is_blamed_is_believed_again_only_once_it_follows():
     """However uncertain the state of charge is made by the same error."""
-    gate, uncertain = InnovationGate(), 0.3**2
-    for _ in range(round(CONTRADICTED)):
-        gate.update(1.0, 0.3, 0.0, SLOW, LOAD)
-    gate.blame_both()
-    blamed = [gate.update(1.0, 0.3, uncertain, SLOW, LOAD) for _ in range(1800)]
+    gate, uncertain = InnovationTest(), 0.3**2
+    for _ in range(round(PACK.contradicted_s)):
+        gate.noise(1.0, 0.3, 0.0, SLOW, LOAD, RESTARTED)
+    gate.blame_model(SLOW + LOAD)
+    blamed = [gate.noise(1.0, 0.3, uncertain, SLOW, LOAD, RESTARTED) for _ in range(1800)]
     assert blamed[-1] == pytest.approx(0.3**2, rel=0.1)
-    followed = [gate.update(1.0, 0.01, uncertain, SLOW, LOAD) for _ in range(7200)]
+    followed = [gate.noise(1.0, 0.01, uncertain, SLOW, LOAD, RESTARTED) for _ in range(7200)]
     assert followed[-1] == pytest.approx(LOAD)
 
 
@@ -78,16 +78,16 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
     for parallel in (BATTERY.cells_parallel, 10 * BATTERY.cells_parallel):
         battery = replace(BATTERY, cells_parallel=parallel)
         charge = 3600 * battery.pack_capacity(25.0)
-        uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
-        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], 0.0))
+        uncertainty = ChargeNoise(battery, VEHICLE.parameters)
+        variances.append(uncertainty.counted(60.0, 0.0, charge, CurrentSource.NONE, 0.0))
     assert variances[1] == pytest.approx(variances[0], rel=1e-4)
-    assert variances[0] ** 0.5 == pytest.approx(15.0 / 32.8 / 60 * 2**0.5, rel=1e-3)
+    assert variances[0] ** 0.5 == pytest.approx(0.46 / 60 * 2**0.5, rel=1e-3)
 
 
 def test_two_currents_that_differ_confirm_each_other_to_no_better():
     battery, charge = BATTERY, 3600 * BATTERY.pack_capacity(25.0)
-    uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
-    sd = uncertainty.counted(3600.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.PACK], 2.5) ** 0.5
+    uncertainty = ChargeNoise(battery, VEHICLE.parameters)
+    sd = uncertainty.counted(3600.0, 0.0, charge, CurrentSource.PACK, 2.5) ** 0.5
     assert sd > 2.5 * 3600 / charge, "as if it were an offset of that"
 
 
@@ -120,49 +120,54 @@ def test_a_fix_is_below_only_while_it_is_reported():
     assert not signals.fix_below(10.0, FIX_3D)
 
 
-def wait(steady: SteadyVoltage, voltage, seconds: float):
-    """(time [s] at which the wait is over, what it gives)."""
+def started(voltage, seconds: float):
+    """(time [s] of the first state of charge, estimator); a pack with this voltage [V] over time and no current."""
+    groups = [Group("Pack", ("pack_voltage", "pack_current"), 0.1), Group("Motor", ("motor_speed",), 0.1)]
+    e = EventEstimator(groups, BATTERY, VEHICLE.model, VEHICLE.riding)
     for step in range(round(seconds * 10) + 1):
-        if found := steady.step(step / 10, voltage(step / 10), 0.0, 25.0, 0.0, 1.0, STEADY_TIME):
-            return step / 10, found
-    return None
+        e.handle((step / 10, 0, (voltage(step / 10), 0.0)))
+        e.handle((step / 10, 1, (0.0,)))
+        if e.filter:
+            return step / 10, e
+    return None, e
 
 
 def test_the_first_voltage_is_waited_for():
-    now, (first, sd) = wait(SteadyVoltage(BATTERY), lambda t: 52.0, 5.0)
-    assert (now, first.voltage, sd) == (STEADY_TIME, 52.0, 0.0)
-    assert first.moving is False
-    now, (first, _) = wait(SteadyVoltage(BATTERY), lambda t: min(20.0 + 40 * t, 52.0), 60.0)
-    assert first.voltage == 52.0
-    assert now == pytest.approx(first.time + STEADY_AFTER, abs=0.11)
-    now, (_, sd) = wait(SteadyVoltage(BATTERY), lambda t: 50.0 + 2 * (t * 10 % 2), 100.0)
-    assert now == STEADY_WAIT
-    assert sd == pytest.approx(BATTERY.ocv(1.0)[0] - BATTERY.ocv(0.0)[0])
+    now, e = started(lambda t: 52.0, 5.0)
+    assert now <= PACK.steady_s + 2 * WINDOW
+    steady = e.estimate(now).soc
+    now, e = started(lambda t: min(20.0 + 40 * t, 52.0), 60.0)
+    assert e.estimate(now).soc == pytest.approx(steady, abs=0.01)
+    assert now == pytest.approx(PACK.resettled_s + 1.0, abs=2 * WINDOW)
+    now, e = started(lambda t: 50.0 + 4 * (t // WINDOW % 2), 100.0)
+    assert now == pytest.approx(PACK.longest_wait_s, abs=2 * WINDOW)
+    assert e.filter.covariance[0] ** 0.5 > 0.25  # nothing is known of it
 
 
 def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
     """6 mV that stay are worth 5 % of charge where the curve rises by 0.1 V over 80 %, however often they are seen."""
     flat = replace(VEHICLE.pack, ocv_curve=PiecewiseLinear((0.0, 0.1, 0.9, 1.0), (2.5, 3.2, 3.3, 3.6)))
-    uncertainty = VoltageUncertainty(flat, VEHICLE.parameters)
-    assert not uncertainty.tells_more(0.5, 0.03**2)
-    assert uncertainty.tells_more(0.5, 0.10**2)
-    assert uncertainty.tells_more(0.05, 0.03**2)
+    history = VoltageNoise(flat, VEHICLE.parameters).history
+    assert flat.ocv(0.5)[1] ** 2 * 0.03**2 < history
+    assert flat.ocv(0.5)[1] ** 2 * 0.10**2 > history
+    assert flat.ocv(0.05)[1] ** 2 * 0.03**2 > history
 
 
 def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():
     """History, place on the curve and sensor stay: the better SOC is known, the more of the error does."""
-    uncertainty = VoltageUncertainty(VEHICLE.pack, VEHICLE.parameters)
-    times = [uncertainty.slow(0.6, 25.0, sd**2).time for sd in (0.2, 0.05, 0.01, 0.003)]
+    uncertainty = VoltageNoise(VEHICLE.pack, VEHICLE.parameters)
+    slope = VEHICLE.pack.ocv(0.6)[1]
+    times = [uncertainty.slow(0.6, slope, 25.0, sd**2)[1] for sd in (0.2, 0.05, 0.01, 0.003)]
     assert times == sorted(times)
     assert times[0] < 1.02 * uncertainty.error_time(25.0)
-    assert 0.75 * HISTORY_TIME < times[-1] < HISTORY_TIME
-    assert uncertainty.slow(0.6, 10.0, 0.01**2).variance > uncertainty.slow(0.6, 25.0, 0.01**2).variance
+    assert 0.75 * PRIOR.history_s < times[-1] < PRIOR.history_s
+    assert uncertainty.slow(0.6, slope, 10.0, 0.01**2)[0] > uncertainty.slow(0.6, slope, 25.0, 0.01**2)[0]
 
 
 def test_resistances_that_are_guessed_make_a_loaded_voltage_worth_less():
     parameters = VEHICLE.parameters
     known = {**parameters.known}
     known["cell_resistance_factor"] = replace(known["cell_resistance_factor"], sd=0.5)
-    measured, guessed = (VoltageUncertainty(VEHICLE.pack, p) for p in (parameters, Parameters(known)))
-    load = (0.04, (0.05, 0.03), CurrentSource.PACK, True, 0.0)
-    assert guessed.load(*load) > 10 * measured.load(*load)
+    measured, guessed = (VoltageNoise(VEHICLE.pack, p) for p in (parameters, Parameters(known)))
+    fast = [noise.fast(0.04, (0.05, 0.03), CurrentSource.PACK, noise.resistance, 0.0) for noise in (measured, guessed)]
+    assert fast[1] > 10 * fast[0]

@@ -7,11 +7,23 @@ from math import exp
 
 import pytest
 
+from gz_onboard.estimator.battery_priors import Past, uncounted, uncounted_sd
 from gz_onboard.estimator.plausibility.limits import LimitCheck
 from gz_onboard.estimator.plausibility.residual import CONFIG
-from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, flat_pack, follow, worst
+from tests.estimator.life import (
+    CELLS,
+    GROUPS,
+    INVERTER,
+    MOTOR,
+    PACK,
+    Scooter,
+    estimator,
+    flat_pack,
+    follow,
+    set_soc,
+    worst,
+)
 from tests.events import ShownSignals
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
@@ -121,7 +133,7 @@ def test_a_jump_from_a_start_up_value_is_accepted():
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
 def test_a_pause_is_as_uncertain_as_a_restart(gap):
-    assert uncounted_sd(gap) == uncounted(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
+    assert uncounted_sd(gap) == uncounted(Past(), gap, Past(0.0), 32.8, 52.0)[1]
 
 
 @pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])
@@ -129,7 +141,7 @@ def test_a_pause_is_as_uncertain_as_a_restart(gap):
 def test_what_flowed_in_a_pause_is_covered(gap, speed):
     scooter, e = Scooter(soc=0.7, seed=1), estimator()
     follow(e, scooter.live(60), scooter)
-    e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
+    set_soc(e, scooter.soc, 1e-8, 1e-8)
     scooter.away(gap, speed)
     e.handle(next(scooter.live(0.1, speed)))
     e.close()
@@ -141,9 +153,9 @@ def test_what_flowed_in_a_pause_is_covered(gap, speed):
 def test_a_late_voltage_is_used_however_seldom_it_comes(period, latency):
     groups = [Group(group.message, group.roles, period) for group in GROUPS]
     scooter, e = Scooter(soc=0.8, period=period), estimator(groups)
-    e.soc.synchroniser.latency = latency
+    e.pack.synchroniser.latency = latency
     follow(e, scooter.live(60), scooter)
-    e.filter.soc, e.filter.covariance = scooter.soc + 0.1, (0.01, 0.0, 1e-6)
+    set_soc(e, scooter.soc + 0.1, 0.01, 1e-6)
     rows = follow(e, scooter.live(600, 11.0), scooter)
     assert abs(rows[-1][1].soc - scooter.soc) < 0.05
     assert worst(rows) < 3
@@ -184,9 +196,9 @@ def test_a_gps_without_a_fix_tells_no_speed():
         {"gyro_bias": [0.0, 0.5]},
         {"soc": -0.04},
         {"soc": 1.04},
-        {"covariance": [-0.01, 0.0, 1e-6]},
-        {"covariance": [0.3, 0.0, 1e-6]},
-        {"covariance": [float("inf"), 0.0, 1e-6]},
+        {"soc_variance": -0.01},
+        {"soc_variance": 0.3},
+        {"error_variance": float("inf")},
         {"v1": float("nan")},
     ],
     ids=str,

@@ -7,8 +7,8 @@ from math import exp
 
 import pytest
 
+from gz_onboard.estimator.battery_pack import PACK
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.soc import JOINED
 from gz_onboard.events import Group
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Model
@@ -30,7 +30,7 @@ def test_at_full_speed_the_polarisation_is_that_of_full_speed():
     power = e.forecaster.load.power(e.forecaster.load.quantities(speed, 0.0, Conditions(17.0, 0.0)))
     reaction = Model(tuple(x for x in model.effects if x.name != "slow_relaxation"), model.parameters)
     settled, p = reaction.overpotential(battery), model.parameters
-    slow = p["slow_resistance"] * (1 - exp(-JOINED / p["slow_time"]))
+    slow = p["slow_resistance"] * (1 - exp(-PACK.joined_s / p["slow_time"]))
 
     def lost(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
         return slow * current + (settled(current, soc, temperature, form_factor_squared) if settled else 0.0)

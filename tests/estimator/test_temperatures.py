@@ -28,7 +28,7 @@ def ridden(vehicle: Vehicle, seconds: float, cells: float = 60.0, air: float = 1
         t, current = step * DT, 0.5 if step < 30 else AMPERES
         cell = current / battery.cells_parallel
         soc, v1, _ = battery.advanced(DT, soc, v1, cell, CELLS)
-        lost = e.soc.effects.overpotential
+        lost = e.pack.effects.overpotential
         volts = battery.pack_voltage(battery.terminal_voltage(soc, v1, cell, CELLS)[0] - lost, current)
         if step % 10 == 0 and t < cells:
             e.handle((t, THERMAL, (CELLS,)))
@@ -44,7 +44,7 @@ def by_network(vehicle: Vehicle, seconds: float) -> float:
     battery, p = vehicle.pack, vehicle.parameters
     network, cell = LumpedCooling(p, "pack", CELLS), AMPERES / battery.cells_parallel
     r0, r1, _ = battery.circuit(0.85, CELLS)
-    lost = r0 * cell + r1 * cell + ridden(vehicle, 60.0).soc.effects.overpotential
+    lost = r0 * cell + r1 * cell + ridden(vehicle, 60.0).pack.effects.overpotential
     watts = battery.cells_series * lost * AMPERES + p["pack_series_resistance"] * AMPERES**2
     watts += battery.reversible_heat(AMPERES, 0.85, CELLS)
     for _ in range(round(seconds)):
@@ -78,4 +78,4 @@ def test_air_that_is_not_measured_is_as_much_colder_than_the_cells_as_their_heat
 
 def test_cells_that_were_never_measured_warm_from_the_airs_temperature() -> None:
     e = ridden(VEHICLE, 200.0, cells=0.0)
-    assert e._temperatures.step(200.0, 0.0, e.soc.heat) > AMBIENT + 1.0
+    assert e._temperatures.step(200.0, 0.0, e.pack.heat) > AMBIENT + 1.0

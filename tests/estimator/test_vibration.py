@@ -232,7 +232,7 @@ def test_what_was_learned_outlives_a_restart(rough):
     at = (0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
     mended = first.forecaster
     mended.learner._segment = mended.learner._segment.__class__()  # a restart drops the open segment
-    first.soc.ageing.restore(first.soc.ageing.snapshot())  # and uses at once what else is only used now and then
+    first.pack.age.apply(first.filter)  # and uses at once what else is only used now and then
     assert second.forecaster.forecast(*at) == mended.forecast(*at)
     with pytest.raises(ValueError, match="rough_road"):
         estimated(BASE, []).restore(saved, BASE.key, 5.0)
@@ -243,7 +243,7 @@ def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
     for vibration in (0.01, 2.5):
         e = estimated(loose, events(60, vibration))
-        assert e.soc.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
+        assert e.pack.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
     settled = e.forecaster._overpotential
     assert settled is not None
     assert settled(1.0, 0.5, 20.0, 2.0) == pytest.approx(0.01 * TYPICAL)

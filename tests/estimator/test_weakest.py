@@ -102,7 +102,7 @@ def left(estimator: Any, weakest: WeakGroup | None) -> float:
     """The energy [J] that it expects to be left, were this known of the weakest group."""
     known = estimator.battery.health.weakest
     estimator.battery.weaken(weakest)
-    soc, sd = estimator.soc.ageing.state_of_charge(estimator.filter)
+    soc, sd = estimator.pack.soc
     found = estimator.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0).energy
     estimator.battery.weaken(known)
     return float(found)
@@ -177,7 +177,7 @@ def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
     explainer, weakest, ends = found.explainer, found.battery.health.weakest, []
     for known in (weakest, None):
         found.battery.weaken(known)
-        soc, sd = found.soc.ageing.state_of_charge(found.filter)
+        soc, sd = found.pack.soc
         forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
         ends.append(explainer.state(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0))
     found.battery.weaken(weakest)
@@ -223,7 +223,7 @@ def test_a_charge_or_a_new_state_of_charge_begins_another_block():
     charged = False
     for event in heard(WEAK):
         if len(blocks) == 3 and estimator.weakest._block.count > 3 and not charged:
-            charged, estimator.filter.soc = True, estimator.filter.soc + 0.2
+            charged, estimator.pack.state = True, estimator.filter._replace(soc=estimator.filter.soc + 0.2)
         estimator.handle(event)
         if len(blocks) == 6:
             break
@@ -256,11 +256,17 @@ def test_a_lie_from_the_start_teaches_nothing(name: str):
     assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.005)
 
 
+def charged(saved: dict[str, Any]) -> None:
+    """Charge the pack of a saved state to `START`."""
+    saved |= {"soc": START, "soc_variance": 1e-4, "error_variance": 1e-4}
+    saved["learned"]["capacity_with_soc"] = 0.0
+
+
 @pytest.mark.parametrize("name", LIES)
 def test_a_lie_changes_nothing_that_was_learned(name: str):
     before = at(WEAK, 0.2)
     saved, known = before.snapshot("key"), before.weakest.learned()
-    saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]  # charged meanwhile
+    charged(saved)
     found = ridden(WEAK, 0.57, LIES[name](), saved)
     for x, learned in found.weakest.learned().items():
         assert abs(learned.value - known[x].value) < 1.5 * known[x].sd
@@ -360,8 +366,8 @@ def test_what_is_weak_in_one_vehicle_is_not_in_another():
 def test_another_pack_begins_with_no_weak_group():
     """Of packs that are told apart by their resistance."""
     saved = at(WEAK, 0.2).snapshot("key")
-    saved["learned"]["resistance"]["factor"] = 1.6
-    saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]
+    saved["learned"]["resistance"] = 1.6
+    charged(saved)
     found = ridden(Hidden(), 0.55, saved=saved)
     assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
     for x in found.weakest.learned().values():

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.energy_counter import EnergyCounter
+from gz_onboard.estimator.pack_age import Learned
 from gz_onboard.events import Activity, Estimate, State
 from gz_onboard.log_rows import ESTIMATE_TOPIC, STATUS_TOPIC, declare, estimate_row, learned_row, ride_row
 from tests.support import S
