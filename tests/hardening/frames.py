@@ -194,6 +194,7 @@ class Watch:
         """Hold all that came since the last check against the promises; AssertionError if one is broken."""
         run, codec, second = self.run, self.run.pipeline.codec, self.second
         check_sound(run)
+        codec.windows()  # counts the frames of the window under way
         times = [self._time, *(e.time for e in run.estimates)]
         assert all(isfinite(b) and b >= a for a, b in pairwise(times)), "the time of the estimates goes back"
         latest = second.latest
