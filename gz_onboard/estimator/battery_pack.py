@@ -152,7 +152,9 @@ class InnovationTest:
         self.misfit += (square / expected - self.misfit) * min(dt / PACK.matching_s, 1.0)
         self._model_is_blamed = self._model_is_blamed and self.misfit > 1
         self.square += (square - self.square) * min(dt / PACK.innovation_s, 1.0)
-        odds = log_likelihood(error, restarted + known) - log_likelihood(error, own + known)
+        odds = 0.0
+        if square > own + known:  # otherwise a start again is no likelier
+            odds = log_likelihood(error, restarted + known) - log_likelihood(error, own + known)
         self.contradicted = self.contradicted + dt if odds > PACK.contradicted_odds else 0.0
         self.off = self.off + 1 if square > PACK.glitch_sd**2 * (own + believed) else 0
         if self.off:  # a large error of the model is not to become a slow one

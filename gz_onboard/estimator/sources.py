@@ -41,14 +41,6 @@ class PackReading(NamedTuple):
         estimate.current_modelled = self.source is CurrentSource.MODEL
 
 
-class PackState(NamedTuple):
-    """What is known of the pack at one step, beside the signals."""
-
-    reading: PackReading
-    temperature: float  # degC, of the cells
-    speed: float | None  # m/s
-
-
 class Synchroniser:
     """Keeps the one that comes first, and interpolates it. `latency` [s]: of the voltage; negative: of the current."""
 
