@@ -52,15 +52,18 @@ def decode(
     body = text[head.end() :]
     if zlib.crc32(body[:-1]) != int(head[1], 16) or not body.endswith(b"}\n"):
         raise ValueError("is damaged: its checksum is wrong")
-    document = json.loads(b"{" + body)
-    saved_at, saved_uptime = document["saved_at"], document["uptime"]
+    try:
+        document = json.loads(b"{" + body)
+        snapshot, saved_at, saved_uptime = document["estimator"], float(document["saved_at"]), document["uptime"]
+    except (ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:  # not written by `encode`
+        raise ValueError("is not a saved state, although its checksum is right") from error
     age = time - saved_at if CLOCK_SET_S < saved_at <= time else None
     # A board without a real-time clock continues from the last time it knew, however long it was off. Two clocks that
     # agree on the time since the same boot are believed all the same.
     if age is not None and kept < saved_at - CLOCK_BEHIND_S:
         same_boot = uptime and saved_uptime and abs(uptime - saved_uptime - age) < CLOCKS_AGREE_S
         age = age if same_boot else None
-    return document["estimator"], age
+    return snapshot, age
 
 
 def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:
@@ -108,6 +111,8 @@ def load(
 ) -> tuple[Mapping[str, Any], float | None] | None:
     """`decode` one file; None if there is no such file. ValueError if it cannot be read or is damaged."""
     try:
+        if file.exists() and not file.is_file():
+            raise ValueError("cannot be read: it is not a file")  # reading a pipe would never end
         with file.open("rb") as stream:
             text = stream.read(LARGEST_FILE_BYTES)
     except FileNotFoundError:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import socket
 import stat
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -88,6 +91,23 @@ def test_clients_that_stall_or_flood_are_left(listening, monkeypatch):
     with socket.socket(socket.AF_UNIX) as client:  # one that goes away at once
         client.connect(str(path))
     assert ask(path, {"status": True})["ok"]
+
+
+def test_clients_are_answered_once_files_can_be_opened_again(listening, monkeypatch):
+    monkeypatch.setattr(control, "RETRY_S", 0.05)
+    _, path = listening
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(5)
+        os.close(lowest_free := os.dup(0))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+        try:
+            client.connect(str(path))
+            time.sleep(0.2)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        client.sendall(b'{"status": true}\n')
+        assert b'"ok": true' in client.recv(65536)
 
 
 def test_a_socket_left_behind_is_taken_over_and_nothing_else(tmp_path, pipeline):

@@ -100,6 +100,11 @@ def sealed(text: bytes) -> bytes:
         b"\x00" * 4096,  # what a power cut leaves of a file that was not synced
         b"\xff\xfe{",
         b'{"saved_at": 1.7e9, "estimator": {}}',  # without a checksum
+        sealed(b'"saved_at": 1.7e9}'),
+        sealed(b'"estimator": {}}'),
+        sealed(b'"saved_at": 1.7e9, "estimator": {"name": "\xfc"}}'),
+        sealed(b'"a": ' + b"[" * 100_000 + b"}"),
+        sealed(b'"saved_at": ' + b"9" * 5000 + b', "estimator": {}}'),
         sealed(b'"saved_at": 1.7e9, "estimator": {}}')[:-1],
         sealed(b'"saved_at": 1.7e9, "estimator": {}}') + b"}",
         sealed(b'"saved_at": 1.7e9, "estimator": "' + b" " * (1 << 20) + b'"}'),
@@ -134,6 +139,12 @@ def test_the_one_before_is_kept(tmp_path: Path):
     assert state.load(latest, NOW) == ({"n": 2}, 0.0)
     assert state.load(before, NOW) == ({"n": 1}, 0.0)
     assert sorted(tmp_path.iterdir()) == sorted([latest, before])
+
+
+def test_a_pipe_in_its_place_is_refused(tmp_path: Path):
+    os.mkfifo(tmp_path / "scooter.json")
+    with pytest.raises(ValueError, match="not a file"):
+        state.load(tmp_path / "scooter.json", NOW)
 
 
 def test_not_a_number_is_not_saved(tmp_path: Path):

@@ -8,11 +8,13 @@ nothing here raises for it.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
+import os
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.errors import InputError
@@ -36,9 +38,10 @@ NO_SOCKETS = (  # the meaning of EAFNOSUPPORT
 )
 _FRAME = struct.Struct("=IB3x8s")
 _FILTER = struct.Struct("=II")
-_TIMESPEC = struct.Struct("=qq")
-_COUNT = struct.Struct("=I")
-_ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
+_CONTROL = struct.Struct("@NiillNiiI0N")
+"""Two control messages: length, level, SO_TIMESTAMPNS, s, ns; length, level, SO_RXQ_OVFL, count. In the machine's own
+longs: 32 bits on a 32-bit board."""
+BATCH = 128  # frames that one call of recvmmsg(2) reads at most
 
 
 def create_socket() -> socket.socket:
@@ -49,6 +52,59 @@ def create_socket() -> socket.socket:
 def bind_socket(raw: socket.socket, channel: str) -> None:
     """Bind a socket to a CAN interface. OSError if there is none, or if it is down."""
     raw.bind((channel,))
+
+
+class _IoVec(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
+
+
+class _Header(ctypes.Structure):
+    """``struct msghdr``."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_size", ctypes.c_uint32),
+        ("io_vector", ctypes.POINTER(_IoVec)),
+        ("io_vectors", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_size", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    """``struct mmsghdr``."""
+
+    _fields_ = (("header", _Header), ("received", ctypes.c_uint))
+
+
+class _BatchReader:
+    """Reads many CAN frames with one system call, recvmmsg(2)."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
+        self._data = ctypes.create_string_buffer(BATCH * _FRAME.size)
+        self._control = ctypes.create_string_buffer(BATCH * _CONTROL.size)
+        data, control = ctypes.addressof(self._data), ctypes.addressof(self._control)
+        self._vectors = (_IoVec * BATCH)(*(_IoVec(data + i * _FRAME.size, _FRAME.size) for i in range(BATCH)))
+        self._messages = (_Message * BATCH)()
+        for i, message in enumerate(self._messages):
+            header = message.header
+            header.io_vector, header.io_vectors = ctypes.pointer(self._vectors[i]), 1
+            header.control, header.control_size = control + i * _CONTROL.size, _CONTROL.size
+        self._unread = bytes(self._messages)
+
+    def read(self) -> Iterator[tuple[tuple[int, int, bytes], tuple[int, ...]]]:
+        """Return `_FRAME` and `_CONTROL` of the waiting frames, at most `BATCH`. OSError for a bus that is down."""
+        ctypes.memmove(self._messages, self._unread, len(self._unread))  # the kernel has shortened them
+        ctypes.memset(self._control, 0, len(self._control))
+        count = self._receive(self._descriptor, self._messages, BATCH, socket.MSG_DONTWAIT, None)
+        if count < 0 and (number := ctypes.get_errno()) != errno.EAGAIN:
+            raise OSError(number, os.strerror(number))
+        count = max(count, 0)
+        frames, control = self._data.raw[: count * _FRAME.size], self._control.raw[: count * _CONTROL.size]
+        return zip(_FRAME.iter_unpack(frames), _CONTROL.iter_unpack(control), strict=True)
 
 
 class SocketCanBus:
@@ -77,24 +133,20 @@ class SocketCanBus:
         except OSError:
             raw.close()
             raise
+        self._reader = _BatchReader(raw.fileno())
 
     def drain(self, frames: list[Frame], index: int, limit: int, until: float) -> bool:
         """Append the waiting frames, at most `limit`, until a monotonic time [s]; whether more may be waiting."""
-        for number in range(limit):
-            try:
-                data, ancillary, _, _ = self._socket.recvmsg(_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
-            except BlockingIOError:
+        for _ in range(0, limit, BATCH):
+            before = len(frames)
+            for (identifier, length, payload), (_, _, kind, seconds, ns, _, _, counted, lost) in self._reader.read():
+                time_ns = seconds * 1_000_000_000 + ns if kind == SO_TIMESTAMPNS else time.time_ns()
+                frames.append((time_ns, identifier, payload[:length], index))
+                if counted == SO_RXQ_OVFL:  # the kernel's counter wraps
+                    self.overflow += (lost - self.overflow) & 0xFFFFFFFF
+            if len(frames) < before + BATCH:
                 return False
-            time_ns = 0
-            for _level, kind, value in ancillary:
-                if kind == SO_TIMESTAMPNS:
-                    seconds, nanoseconds = _TIMESPEC.unpack(value)
-                    time_ns = seconds * 1_000_000_000 + nanoseconds
-                elif kind == SO_RXQ_OVFL:  # the kernel's counter wraps
-                    self.overflow += (_COUNT.unpack(value)[0] - self.overflow) & 0xFFFFFFFF
-            identifier, length, payload = _FRAME.unpack(data)
-            frames.append((time_ns or time.time_ns(), identifier, payload[:length], index))
-            if not number & 31 and time.monotonic() > until:
+            if time.monotonic() > until:
                 break
         return True
 

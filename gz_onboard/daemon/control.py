@@ -13,6 +13,7 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from math import isfinite
@@ -29,6 +30,7 @@ from gz_onboard.routes.route import ROUTE_COLUMNS, Route, read_route_columns, ro
 
 MAX_REQUEST_BYTES = 8_000_000  # twice a route of the most points with all columns
 TIMEOUT_S = 5.0  # of each read and write
+RETRY_S = 1.0  # after a client that could not be accepted
 UMASK = 0o777 & ~0o660
 LONGEST_NAME = 100
 REQUESTS = ("route", "status")
@@ -47,6 +49,7 @@ class Control:
         self._ready: SimpleQueue[PreparedRoute | None] = SimpleQueue()  # for the daemon's loop to take
         self._name: str | None = None
         self._socket: socket.socket | None = None
+        self._closed = False
 
     def start(self) -> None:
         """Listen, if there is a path. InputError if that is impossible."""
@@ -80,16 +83,21 @@ class Control:
 
     def close(self) -> None:
         """Stop listening."""
+        self._closed = True
         if self._socket and self._path:
             self._path.unlink(missing_ok=True)
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread that accepts clients
             self._socket.close()
 
     def _accept(self, listening: socket.socket) -> None:
-        with suppress(OSError):  # closed
-            while True:
+        while True:
+            try:
                 client, _ = listening.accept()
                 threading.Thread(target=self._converse, args=(client,), daemon=True).start()
+            except (OSError, RuntimeError):  # closed; or too many open files or threads at the moment
+                if self._closed:
+                    return
+                time.sleep(RETRY_S)
 
     def _converse(self, client: socket.socket) -> None:
         """Answer the one request of a client. A client that stalls or goes away is left."""
