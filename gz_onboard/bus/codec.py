@@ -259,6 +259,7 @@ class Codec:
         self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
         self._channel = 0  # of the last frame
         self._inboxes: dict[int, dict[int, list[Frame]]] = {0: {}}  # by channel and identifier, of what was heard
+        self._room = MOST_IDENTIFIERS  # for more of them
         self._errors: list[Frame] = []
         self._strangers: list[Frame] = []  # that no DBC file has
         self._copies: list[Frame] = []  # of answers
@@ -412,7 +413,8 @@ class Codec:
         else:
             inbox = self._strangers
         inboxes = self._inboxes.setdefault(channel, {})
-        if len(inboxes) < MOST_IDENTIFIERS:
+        if self._room:
+            self._room -= 1
             inboxes[identifier] = inbox
         return inbox
 
