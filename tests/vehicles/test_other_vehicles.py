@@ -23,7 +23,8 @@ from gz_onboard.bus.dbc import load_database
 from gz_onboard.bus.mapping import pgn, read_mapping
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.decode import feed
+from gz_onboard.recording.logs import read_frames, read_log
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -198,8 +199,7 @@ def test_tlmoto_real_frames_go_the_whole_way(session):
     path = real("tlmoto_motostudent_kiro", f"{session}.candump.log")
     estimates: list[Estimate] = []
     pipeline = Pipeline(vehicle("tlmoto"), observer=estimates.append)
-    for batch in read_frames(path):
-        pipeline.advance(batch, batch[-1][0])
+    feed(pipeline, read_log(path))
     assert pipeline.counts().dropped == 0
     published = [e for e in estimates if e.state in (State.VALID, State.DEGRADED)]
     assert len(published) > 0.5 * len(estimates)
