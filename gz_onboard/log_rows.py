@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.estimator.energy_counter import EnergyCounter
-from gz_onboard.estimator.pack_age import Learned
+from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
 
@@ -149,7 +149,7 @@ def ride_row(last: Estimate, energy: EnergyCounter, ambient: float | None, rider
     }
 
 
-def learned_row(learned: Mapping[str, Learned]) -> dict[str, dict[str, float]]:
+def learned_row(learned: Mapping[str, LearnedFactor]) -> dict[str, dict[str, float]]:
     """Return the learned battery as a row."""
     return {
         name: {"factor": round(x.value, 4), "sd": round(x.sd, 4), "share": round(x.share, 3)}

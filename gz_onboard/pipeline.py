@@ -1,4 +1,4 @@
-"""Codec, estimator, publisher and recorder in one row: the same for a live bus, a replayed log and an offline estimate.
+"""Codec, estimator, publisher and recorder in a row: the same for a live bus, a replayed log and an offline estimate.
 
 Time is that of the frames. Windows of half a second end on a grid of that time, so it does not matter in what
 portions the frames arrive. At the end of each the estimator makes a step and an estimate.
@@ -51,11 +51,11 @@ FREE = (
     *range(0x10, 0x600, 0x10),
     *range(0x18FF_6000 | EFF_FLAG, 0x19FF_6000 | EFF_FLAG, 0x1000),
 )
-"""Where range frames may begin, the first choice first: of 11 bits and low priority, not the diagnosis' above 0x700."""
+"""First identifiers for range frames, best first: 11 bits, low priority, below those of diagnosis from 0x700 on."""
 
 
 def filter_backend(name: str) -> Backend:
-    """The backend of the battery filter, of `FILTERS`; ``filterpy`` imports numpy and scipy. InputError for another."""
+    """Return the backend of the battery filter by its name in `FILTERS`; ``filterpy`` imports numpy and scipy."""
     if name not in FILTERS:
         raise InputError(f"filter {name!r}: must be {' or '.join(FILTERS)}{nearest(name, FILTERS)}")
     if name == "scalar":
@@ -66,7 +66,7 @@ def filter_backend(name: str) -> Backend:
 
 
 class Pipeline:
-    """From the frames of one vehicle to its estimates.
+    """Turns the frames of one vehicle into estimates.
 
     log: where to write, if anywhere; log_frames, log_signals: also the raw frames, and each message's latest
     signals once a second. observer: called with each estimate made, at the end of each window.
@@ -112,7 +112,7 @@ class Pipeline:
             declare(log, [*self.codec.mapping.database.messages, *answers] if log_signals else ())
 
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
-        """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
+        """Process `frames`, ordered by time, up to `until_ns`; return the frames to send."""
         if self._next_ns is None or (frames and not self.codec.started):
             # On a silent bus we say that we are there and have nothing; the grid begins with the first frame.
             self._next_ns, self._ticks = (frames[0][0] if frames else until_ns) + TICK_NS, 0
@@ -139,7 +139,7 @@ class Pipeline:
         return out
 
     def clock_set(self, delta_ns: int) -> None:
-        """The clock that stamps the frames was set by `delta_ns`: go on with the timeline as if it had not been."""
+        """Keep the timeline continuous although the clock that stamps the frames was set by `delta_ns`."""
         self.codec.clock_set(delta_ns)
         if self._next_ns is not None:
             self._next_ns += delta_ns
@@ -176,7 +176,7 @@ class Pipeline:
                 self._sample(self._log, now, time_ns, estimate)
 
     def publish(self, time_ns: int) -> list[Frame]:
-        """The frames to be sent at a tick, after the first window: status, and range if a second has ended with it."""
+        """Return the frames to send at a tick, after the first window: status, and the range once a second."""
         assert self.last is not None
         sent = self.publisher.status(self.last, time_ns)
         if self._range_due:
@@ -194,7 +194,7 @@ class Pipeline:
         self._dropped_before, self._lost_before = counts.dropped, counts.lost
 
     def counts(self) -> Counts:
-        """What was counted since the start."""
+        """Return the counts since the start."""
         codec = self.codec
         return Counts(
             dropped=sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING),
@@ -215,7 +215,7 @@ class Pipeline:
             self._sample_signals(self.signal_log, now, time_ns)
 
     def _sample_signals(self, log: Log, now: float, time_ns: int) -> None:
-        """The latest signals of each message, at the time that they were seen, and the position."""
+        """Log the latest signals of each message, at the time of their frame, and the position."""
         for name, (seen_ns, _, data, _) in self.codec.latest.items():
             if time_ns - seen_ns < WINDOWS_PER_RANGE * WINDOW_NS:  # not again what was logged before
                 log.sample(f"/can/{name}", time_ns, self.codec.values(name, data), seen_ns)
@@ -225,12 +225,12 @@ class Pipeline:
 
     @property
     def foreign(self) -> dict[str, int]:
-        """Frames that someone else sent on the identifiers of our own, by identifier: who reads ours may read his."""
+        """Count frames of another sender on our own identifiers, by identifier: a reader may mistake them for ours."""
         unknown = self.codec.unknown
         return {hexadecimal(i): unknown[i] for i in sorted(self.publisher.identifiers) if i in unknown}
 
     def status(self) -> dict[str, object]:
-        """What was received, dropped and lost since the start, by message and reason; the ride; what was learned."""
+        """Return the counts since the start by message and reason, the ride so far, and the learned values."""
         codec = self.codec
         faults: dict[str, dict[str, int]] = {}
         for (message, reason), count in sorted(codec.faults.items()):
@@ -254,7 +254,7 @@ class Pipeline:
         }
 
     def _ride(self) -> dict[str, object]:
-        """What the estimates of a log do not say of the ride, since the start."""
+        """Return facts of the ride that the logged estimates do not hold."""
         last, estimator = self.last or Estimate(0.0), self.estimator
         return ride_row(
             last, self.energy, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.learner.rider
@@ -262,7 +262,7 @@ class Pipeline:
 
 
 def range_publisher(vehicle: Vehicle) -> Publisher:
-    """What sends the vehicle's range frames.
+    """Make the publisher of the vehicle's range frames.
 
     InputError if its own messages take their identifiers, or if they cannot say what its battery holds, or how far
     that takes it by the prior riding.
@@ -295,17 +295,17 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
 
 
 def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:
-    """What the vehicle's codec knows a frame by."""
+    """Return the key by which the vehicle's codec finds a frame."""
     extended, plain = bool(identifier & EFF_FLAG), identifier & ~EFF_FLAG
     return extended, pgn(plain) if extended and vehicle.mapping.j1939 else plain
 
 
 def lacking(vehicle: Vehicle) -> list[str]:
-    """The reasons that would always be there, were they told: for sensors that the vehicle does not have."""
+    """Return the reasons that would always be set, for sensors that the vehicle does not have."""
     return reason_names(signals.lacking({source.role for source in vehicle.mapping.sources}))
 
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:
-    """The DBC files that a log of this vehicle can be decoded by, by name."""
+    """Return the DBC files that decode a log of this vehicle, by name."""
     own = vehicle.range_dbc.read_bytes() if vehicle.range_identifier is None else vehicle.publisher().dbc()
     return {file.name: file.read_bytes() for file in vehicle.mapping.dbc_files} | {vehicle.range_dbc.name: own}

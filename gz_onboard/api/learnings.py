@@ -9,7 +9,7 @@ from pathlib import Path
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.daemon import learned as command
 from gz_onboard.errors import brief
-from gz_onboard.estimator.pack_age import Learned
+from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.state import state_file
@@ -27,8 +27,8 @@ class LearnedState(Tabular):
 
     vehicle: str
     age_s: float | None
-    battery: Mapping[str, Learned]
-    riders: Mapping[str, Mapping[str, Learned]]
+    battery: Mapping[str, LearnedFactor]
+    riders: Mapping[str, Mapping[str, LearnedFactor]]
 
     __repr__ = brief
 

@@ -18,7 +18,7 @@ from gz_onboard import state
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.consumption import Habits
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.estimator.pack_age import Learned
+from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.estimator.snapshot import check_vehicle
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
@@ -113,27 +113,29 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
         state.write(file, state.encode(changed, 0.0 if age is None else time.time() - age))
 
 
-def battery_learned(estimator: Estimator) -> dict[str, Learned]:
+def battery_learned(estimator: Estimator) -> dict[str, LearnedFactor]:
     """Return the learned battery, by name; the weakest group only if its voltage is on the bus."""
     return estimator.pack.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
 
 
-def riders_learned(estimator: Estimator) -> dict[str, dict[str, Learned]]:
+def riders_learned(estimator: Estimator) -> dict[str, dict[str, LearnedFactor]]:
     """Return the learned habits by rider and name; the last rider comes first."""
     learner = estimator.forecaster.learner
     riders = {learner.rider: learner.habits, **learner.other_riders}
     return {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
 
 
-def _of_habits(habits: Habits, prior: Habits) -> dict[str, Learned]:
+def _of_habits(habits: Habits, prior: Habits) -> dict[str, LearnedFactor]:
     learned = {}
     for name, now, before in zip(Habits._fields, habits, prior, strict=True):
         share = 1 - sqrt(now.level_variance / before.level_variance)
-        learned[name] = Learned(now.level / before.level, sqrt(now.level_variance) / before.level, max(share, 0.0))
+        learned[name] = LearnedFactor(
+            now.level / before.level, sqrt(now.level_variance) / before.level, max(share, 0.0)
+        )
     return learned
 
 
-def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
+def learned_text(battery: Mapping[str, LearnedFactor], riders: Mapping[str, Mapping[str, LearnedFactor]]) -> str:
     """Describe the learned battery and riders for a terminal; an unnamed rider only if something is known."""
     lines = ["per cent learned: share of the initial uncertainty that is gone"]
     lines += [_line(name, x) for name, x in battery.items()]
@@ -144,12 +146,12 @@ def learned_text(battery: Mapping[str, Learned], riders: Mapping[str, Mapping[st
     return "\n".join(lines)
 
 
-def _line(name: str, x: Learned) -> str:
+def _line(name: str, x: LearnedFactor) -> str:
     share = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
     return f"{name:15} {x.value:5.3f} ± {x.sd:5.3f}  {share}: {MEANING[name]}"
 
 
-def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
+def _rows(learned: Mapping[str, LearnedFactor]) -> dict[str, dict[str, object]]:
     return {
         name: {"factor": x.value, "sd": x.sd, "percent_learned": round(100 * x.share), "of": MEANING[name]}
         for name, x in learned.items()

@@ -27,7 +27,7 @@ from gz_onboard.estimator.battery_priors import (
     uncounted_sd,
 )
 from gz_onboard.estimator.cell_effects import LARGEST, CellEffects
-from gz_onboard.estimator.pack_age import AGE, Learned, PackAge
+from gz_onboard.estimator.pack_age import AGE, LearnedFactor, PackAge
 from gz_onboard.estimator.plausibility.residual import ResponseGain
 from gz_onboard.estimator.rest import RestDetector
 from gz_onboard.estimator.saved_fields import Each, Number
@@ -242,7 +242,7 @@ class BatteryPack:
         """See `PackAge.energy_sd`."""
         return self.age.energy_sd(self._believed, energy, slope, soc_sd)
 
-    def learned(self) -> dict[str, Learned]:
+    def learned(self) -> dict[str, LearnedFactor]:
         """Capacity and resistance, by name."""
         return self.age.learned(self._believed)
 

@@ -9,9 +9,9 @@ riding of the vehicle file in the same air, so that cold air or a high pass is n
 - pace: time per metre, stops included;
 - factor: measured over modelled energy of the same motion, the error of the parameters.
 
-Each is one Kalman filter of a slow level and a faster deviation (`Quantity`). The price to expect, and the variance of
-its mean over the way ahead, follow from the filters' states. Power of auxiliaries is measured once, here, where a
-sensor shows it, and is kept out of all four: it is watts, and no price of a metre.
+Each is one Kalman filter of a slow level and a faster deviation (`LearnedQuantity`). The expected price, and the
+variance of its mean over the way ahead, follow from the filters' states. The power of auxiliaries is measured once,
+here, where a sensor shows it, and is kept out of all four: it is watts, and no price of a metre.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ CONSUMPTION = ConsumptionConfig()
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class LearnedQuantity:
     """A quantity of the riding: Kalman filter of a slow level and a faster deviation of the present ride from it.
 
     The level is a random walk over metres, the deviation a first-order Gauss-Markov process (Ornstein-Uhlenbeck) that
@@ -121,7 +121,7 @@ class Quantity:
         """Riding [m] whose mean alone would have the variance of `now`."""
         return self.scatter * CONSUMPTION.segment_m / max(self.variance, 1e-6)
 
-    def learned(self, residual: float, distance: float, noise: float = 0.0) -> Quantity:
+    def learned(self, residual: float, distance: float, noise: float = 0.0) -> LearnedQuantity:
         """State after `distance` [m] that differed from `now` by `residual`; noise: a variance besides the scatter."""
         c = CONSUMPTION
         fade = exp(-distance / c.fade_m)
@@ -134,7 +134,7 @@ class Quantity:
         most = c.outlier_sd * sqrt(total)
         residual = min(max(residual + (1 - fade) * self.deviation, -most), most)
         gain, own_gain = (level + both) / total, (both + own) / total
-        return Quantity(
+        return LearnedQuantity(
             min(max(self.level + gain * residual, 0.0), c.most),
             level - gain * (level + both),
             self.ride_variance,
@@ -153,32 +153,32 @@ class Quantity:
         variance += unknown * self.ride_variance + self.scatter * min(CONSUMPTION.segment_m / max(distance, 1.0), 1.0)
         return self.level + share * self.deviation, variance
 
-    def next_ride(self) -> Quantity:
+    def next_ride(self) -> LearnedQuantity:
         """State before another ride; the deviation of this one teaches how unlike rides are."""
         c = CONSUMPTION
         seen = self.deviation**2 + self.deviation_variance
         ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
-        return Quantity(
+        return LearnedQuantity(
             self.level, self.level_variance, min(max(ride_variance, c.least_sd**2), c.most_variance), self.scatter
         )
 
-    def doubted(self, seen: float) -> Quantity:
+    def doubted(self, seen: float) -> LearnedQuantity:
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
         more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
         return replace(self, deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
 
-    def scaled(self, by: float) -> Quantity:
+    def scaled(self, by: float) -> LearnedQuantity:
         """The same quantity in a unit that is `by` times smaller."""
-        return Quantity(*(x * by**power for x, power in zip(astuple(self), (1, 2, 2, 2, 1, 2, 2), strict=True)))
+        return LearnedQuantity(*(x * by**power for x, power in zip(astuple(self), (1, 2, 2, 2, 1, 2, 2), strict=True)))
 
 
 class Habits(NamedTuple):
     """Riding of one rider. All but the factor are in units of the prior riding."""
 
-    price: Quantity
-    stops: Quantity
-    pace: Quantity
-    factor: Quantity
+    price: LearnedQuantity
+    stops: LearnedQuantity
+    pace: LearnedQuantity
+    factor: LearnedQuantity
 
     @classmethod
     def before(cls, prior: PriorRiding, stops: float) -> Habits:
@@ -187,7 +187,9 @@ class Habits(NamedTuple):
         price_sd = sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, max(c.price_scatter * prior.drift, c.least_sd)
         levels = prior.factor, stops, 1.0, prior.factor
         sds = price_sd, c.stops_sd, c.pace_sd, (prior.factor_sd, *c.factor_sd)
-        return cls(*(Quantity(level, *(sd * sd for sd in each)) for level, each in zip(levels, sds, strict=True)))
+        return cls(
+            *(LearnedQuantity(level, *(sd * sd for sd in each)) for level, each in zip(levels, sds, strict=True))
+        )
 
     def next_ride(self) -> Habits:
         """Before another ride."""
@@ -641,7 +643,7 @@ def _saved(habits: Habits) -> dict[str, dict[str, float]]:
 def _restored(saved: Mapping[str, Mapping[str, float]], price: float, pace: float) -> Habits:
     """Habits as saved, in units that are `price` and `pace` times smaller; ValueError for some that no riding has."""
     scales = {"price": price, "stops": price, "pace": pace, "factor": price}
-    habits = Habits(**{name: Quantity(**quantity).scaled(scales[name]) for name, quantity in saved.items()})
+    habits = Habits(**{name: LearnedQuantity(**quantity).scaled(scales[name]) for name, quantity in saved.items()})
     for q in habits:
         possible = q.level >= 0 and all(abs(x) <= CONSUMPTION.most for x in astuple(q))
         possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
@@ -650,7 +652,7 @@ def _restored(saved: Mapping[str, Mapping[str, float]], price: float, pace: floa
     return habits
 
 
-_HABITS = {name: {f.name: FINITE for f in fields(Quantity)} for name in Habits._fields}
+_HABITS = {name: {f.name: FINITE for f in fields(LearnedQuantity)} for name in Habits._fields}
 _POSITIVE, _ANY = Number(0.0, 1e12), Number(-1e12, 1e12)
 _SIGNED = "measured", "stops", "auxiliary", "modelled", "level", "climb"
 _SUMS = dict.fromkeys(Segment._fields, _POSITIVE) | dict.fromkeys(_SIGNED, _ANY)

@@ -95,17 +95,17 @@ class Estimator:
         return self.pack.state
 
     def vibration(self, now: float) -> float:
-        """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
+        """Return the ``vibration`` that effects read [m/s²] at `now` [s]: a typical value while it is unknown."""
         return self._load.vibration(now)
 
     def ridden_by(self, rider: str) -> None:
-        """`rider` rides from now on."""
+        """Switch to the habits of `rider`."""
         self.forecaster.ridden_by(rider)
 
     # --- one step ---------------------------------------------------------------------------------------------
 
     def step(self, windows: Sequence[MessageWindow]) -> None:
-        """Take what came of each message in one window and go on to the last of it; without any nothing happens."""
+        """Advance to the end of one window with the samples of each message; an empty window changes nothing."""
         if not windows:
             return
         now = max(self._time or 0.0, *(window.time for window in windows))
@@ -161,7 +161,7 @@ class Estimator:
         return dt
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
-        """What the pack gives by the sensors, else by the model."""
+        """Read voltage and current of the pack by the sensors, else by the model."""
         reading = self.plausibility.pack.read(now, dt, self.motion.speed, sqrt(self.pack.test.square))
         self.pack.doubt(now, reading.voltage_doubted)
         speed = self.motion.speed
@@ -173,7 +173,7 @@ class Estimator:
         return reading
 
     def _cell_error(self, voltage: float, current: float, sensor: str) -> float:
-        """What the sensor checks compare with, as the next two."""
+        """Return the measured minus predicted cell voltage, for the sensor checks."""
         return self.pack.cell_error(self._time or 0.0, (voltage, current), sensor) or 0.0
 
     def _road_power(self) -> float | None:
@@ -184,7 +184,7 @@ class Estimator:
         return self._load.power_at(self._time or 0.0, speed, acceleration)
 
     def _compare_grades(self, now: float, dt: float, gap: bool) -> None:
-        """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
+        """Compare the sensors of the grade; forget everything learned from a sensor that is newly distrusted."""
         grades, reading = self.plausibility.grades, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
         towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
@@ -227,7 +227,7 @@ class Estimator:
         self.forecaster.learner.auxiliaries.step(min(dt, self.signals.pause), measured, sum(loads) if loads else None)
 
     def _ride(self, now: float, dt: float) -> None:
-        """Learn from the riding, where its consumption is known."""
+        """Learn from the ride while its consumption is known."""
         speed, reading = self.motion.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.plausibility.speeds.disputed
         known = 0 < dt <= self.signals.pause and not unsure and self._activity.teaches
@@ -248,7 +248,7 @@ class Estimator:
         )
 
     def _drive(self, now: float, voltage: float, power: float) -> float:
-        """What the motor takes [W] of the `power` of the pack at `voltage` [V]."""
+        """Return the motor's part [W] of the `power` of the pack at `voltage` [V]."""
         signals = self.signals
         current, torque = signals.inverter_current.get(now), signals.motor_torque.get(now)
         if current is not None:
@@ -274,7 +274,7 @@ class Estimator:
     # --- results ----------------------------------------------------------------------------------------------
 
     def estimate(self, now: float) -> Estimate:
-        """What is known at `now` [s]; cheap, and changes nothing."""
+        """Return the estimate at `now` [s]; cheap, and changes nothing."""
         motion, filter_ = self.motion, self.filter
         reasons = self._reasons(now)
         estimate = Estimate(time=now, reasons=Reason(reasons), distrusted=self._distrusted, distance=motion.distance)
@@ -322,7 +322,7 @@ class Estimator:
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self, key: str) -> dict[str, Any] | None:
-        """What is to be kept over a restart, for the vehicle `key`; None while there is nothing to keep."""
+        """Return the state to save for the vehicle `key`; None before there is any."""
         if self.filter is None:
             return None
         return self.pack.snapshot() | {
@@ -336,11 +336,11 @@ class Estimator:
         }
 
     def learned_snapshot(self) -> dict[str, Any]:
-        """What was learned of the pack's age, as part of the saved state."""
+        """Return the learned age of the pack, a part of the saved state."""
         return {**self.pack.learned_snapshot(), "weakest": self.weakest.snapshot()}
 
     def wait(self, seconds: float) -> None:
-        """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
+        """Age the restored state by `seconds` [s] in which no voltage has come."""
         self.pack.wait(seconds)
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:

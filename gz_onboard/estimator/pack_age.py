@@ -64,7 +64,7 @@ FIELDS = {
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedFactor:
     """A factor on the vehicle file's value."""
 
     value: float
@@ -191,14 +191,14 @@ class PackAge:
         up = min(up, max(belief.inverse - 1, 0.0) + self._new_sd)
         return sqrt(by_itself + (down * by_age) ** 2), sqrt(by_itself + (up * by_age) ** 2)
 
-    def learned(self, state: FilterState) -> dict[str, Learned]:
+    def learned(self, state: FilterState) -> dict[str, LearnedFactor]:
         """Capacity and resistance over the vehicle file's values, by name."""
         factor, sd = 1 / self.belief.inverse, sqrt(self.belief.variance)
         left = min(self.belief.variance, state.covariance[7], self._unknown)
         known = 1 - sqrt(self._proven[0][1]) / AGE.aged_resistance_sd
         return {
-            "capacity": Learned(factor, sd * factor * factor, 1 - sqrt(left / self._unknown)),
-            "resistance": Learned(self.resistance, self.resistance_sd, max(known, 0.0)),
+            "capacity": LearnedFactor(factor, sd * factor * factor, 1 - sqrt(left / self._unknown)),
+            "resistance": LearnedFactor(self.resistance, self.resistance_sd, max(known, 0.0)),
         }
 
     # --- learning ---------------------------------------------------------------------------------------------

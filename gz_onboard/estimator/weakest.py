@@ -25,7 +25,7 @@ from math import hypot, inf, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.battery_pack import BatteryPack
-from gz_onboard.estimator.pack_age import SAME, Learned
+from gz_onboard.estimator.pack_age import SAME, LearnedFactor
 from gz_onboard.estimator.saved_fields import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
@@ -174,13 +174,13 @@ class WeakestGroup:
         """Whether the vehicle has the signal."""
         return bool(self._signal.stale_after)
 
-    def learned(self) -> dict[str, Learned]:
+    def learned(self) -> dict[str, LearnedFactor]:
         """Charge when full, capacity and resistance of the weakest group over the mean cell's; by `NAMES`."""
         known, holds = self.known, 1 / (1 + self.known.means[CAPACITY])
         factors = 1 - known.means[CHARGE], holds, 1 + known.means[RESISTANCE]
         sds = known.sd(CHARGE), known.sd(CAPACITY) * holds * holds, known.sd(RESISTANCE)
         shares = (max(1 - known.sd(i) / sd, 0.0) for i, sd in enumerate(CONFIG.prior_sd))
-        return {name: Learned(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
+        return {name: LearnedFactor(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
 
     def believed(self) -> WeakGroup | None:
         """The group as used; a difference that is small against its sd and healthy groups' spread counts little."""

@@ -46,7 +46,7 @@ _NEVER_NS = -1 << 62
 _NO_DATA = ERR_FLAG | RTR_FLAG
 
 
-class Step(NamedTuple):
+class LogWindow(NamedTuple):
     """One window: what came between two steps of the estimator."""
 
     end_ns: int  # on the timeline
@@ -57,7 +57,7 @@ class Step(NamedTuple):
 
 
 @dataclass
-class _Column:
+class _RawColumn:
     """The raw values of a signal in the frames of its message, and which of them are real; shape (n,)."""
 
     source: Source
@@ -72,7 +72,7 @@ class _Decoded:
     group: int
     rows: Rows
     time_ns: NDArray[np.int64]  # on the timeline
-    columns: list[_Column]
+    columns: list[_RawColumn]
 
     def windows(self, number: NDArray[np.int64]) -> Iterator[tuple[int, MessageWindow]]:
         """Its windows and the number of each, in their order; number: of the window of each frame of the log."""
@@ -130,7 +130,7 @@ class DecodedLog:
         self.see_latest(len(self.frames))
         return {role: found[role] for group in self.codec.groups for role in group.roles if role in found}
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[LogWindow]:
         """The windows of the live pipeline; with each the codec has counted what it would have counted until then.
 
         They end on a grid that begins with the first frame. In a gap between frames windows without any end, in a
@@ -168,7 +168,7 @@ class DecodedLog:
             clock_ns = int(self.frames.time_ns[end - 1] - self._passed_ns[end - 1])
             for ended in range(before, before + 1 if paused else after):
                 end_ns = TICK_NS + ended * WINDOW_NS
-                yield Step(end_ns, end_ns + clock_ns, follows, slice(begin, end), windows)
+                yield LogWindow(end_ns, end_ns + clock_ns, follows, slice(begin, end), windows)
                 begin, windows, follows = end, [], True
             follows = not paused
         self.see_latest(len(now))
@@ -255,7 +255,7 @@ class DecodedLog:
         self._good[message.name] = rows
         if mapped.group is None:
             return
-        columns: list[_Column] = []
+        columns: list[_RawColumn] = []
         seen: Mask = np.zeros(len(rows), bool)  # with a signal of ours, on a page of a multiplexer
         for source, signal, limits in zip(mapped.sources, mapped.signals, mapped.limits, strict=True):
             raw = _raw(signal, data)
@@ -268,10 +268,10 @@ class DecodedLog:
             self._count(faults, (place, NOT_AVAILABLE), rows[absent])
             self._count(faults, (place, RANGE), rows[present & ~real & ~absent])
             wide = signal.length > _WIDEST_SUM
-            columns.append(_Column(source, raw.astype(float) if wide else raw, real))
+            columns.append(_RawColumn(source, raw.astype(float) if wide else raw, real))
             seen |= present
         if not seen.all():
-            rows, columns = rows[seen], [_Column(c.source, c.raw[seen], c.real[seen]) for c in columns]
+            rows, columns = rows[seen], [_RawColumn(c.source, c.raw[seen], c.real[seen]) for c in columns]
         if len(rows):
             self._decoded.append(_Decoded(mapped.group, rows, self._passed_ns[rows], columns))
 
@@ -323,7 +323,7 @@ def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = N
         progress(len(frames) - done)
 
 
-def _log_frames(pipeline: Pipeline, decoded: DecodedLog, step: Step) -> None:
+def _log_frames(pipeline: Pipeline, decoded: DecodedLog, step: LogWindow) -> None:
     """Log the frames of a window, and between them the status frames that the daemon would have sent."""
     assert pipeline.frame_log
     rows = step.frames
@@ -342,7 +342,7 @@ def _edges(number: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _role_windows(
-    column: _Column, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64]
+    column: _RawColumn, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64]
 ) -> list[RoleWindow | None]:
     """What a signal showed in each window of a part of its message's frames; number: of the window of each frame."""
     source, raw, real, number, time_ns = column.source, column.raw[part], column.real[part], number[part], time_ns[part]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.consumption import Habits, Quantity
+from gz_onboard.estimator.consumption import Habits, LearnedQuantity
 from gz_onboard.estimator.forecast import Forecaster, RangeSmoother
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.physics.riding import PriorRiding
@@ -25,7 +25,7 @@ def test_a_quantity_knows_how_well_it_knows():
     normalised = []
     for _ in range(150):
         usual = rng.normal(1.0, 0.15)
-        quantity = Quantity(1.0, 0.15**2, 0.06**2, 0.2**2)
+        quantity = LearnedQuantity(1.0, 0.15**2, 0.06**2, 0.2**2)
         for _ in range(6):
             level = usual + rng.normal(0, 0.06)
             for _ in range(20):
@@ -38,7 +38,7 @@ def test_a_quantity_knows_how_well_it_knows():
 
 def test_a_quantity_learns_how_unlike_rides_are():
     rng = np.random.default_rng(2)
-    quantity = Quantity(1.0, 0.15**2, 0.05**2, 0.1**2)
+    quantity = LearnedQuantity(1.0, 0.15**2, 0.05**2, 0.1**2)
     for _ in range(60):
         level = 0.9 + rng.normal(0, 0.12)
         for _ in range(24):
@@ -54,7 +54,7 @@ def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
 
 
 def test_far_ahead_the_usual_counts_and_near_the_present():
-    quantity = Quantity(1.0, 0.001, 0.01, 0.01, deviation=0.2, deviation_variance=0.001)
+    quantity = LearnedQuantity(1.0, 0.001, 0.01, 0.01, deviation=0.2, deviation_variance=0.001)
     near, far = quantity.ahead(1000.0), quantity.ahead(1e7)
     assert near[0] == pytest.approx(1.2, abs=0.01)
     assert far[0] == pytest.approx(1.0, abs=0.01)
@@ -67,7 +67,7 @@ def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before,
     rng = np.random.default_rng(3)
     found = []
     for _ in range(80):
-        quantity, smoother = Quantity(1.0, 0.17**2, 0.055**2, 0.2**2), RangeSmoother()
+        quantity, smoother = LearnedQuantity(1.0, 0.17**2, 0.055**2, 0.2**2), RangeSmoother()
         for k in range(4 * 70):
             quantity = quantity.learned((1.0 if k < 4 * before else 1.2) + rng.normal(0, 0.17) - quantity.now, 250.0)
             left = 100_000 - 250.0 * k  # as though it lasted for long
@@ -87,7 +87,7 @@ ANY = st.floats(-1e9, 1e9)
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(ANY, st.floats(1.0, 1e5), st.floats(0.0, 1e12)), min_size=1, max_size=60), st.integers(1, 40))
 def test_whatever_was_learned_can_be_restored(segments, repeats):
-    quantity = Quantity(1.0, 0.15**2, 0.055**2, 0.2**2)
+    quantity = LearnedQuantity(1.0, 0.15**2, 0.055**2, 0.2**2)
     for i, (residual, distance, noise) in enumerate(segments * repeats):
         quantity = quantity.learned(residual, distance, noise)
         if i % 7 == 6:
@@ -158,5 +158,5 @@ def test_a_second_that_accelerates_as_no_road_allows_is_left_out(change, taken):
 
 def test_a_segment_that_no_riding_explains_counts_for_little():
     """A ferry queue that costs a hundred times the price moves it by a tenth."""
-    quantity = Quantity(1.0, 0.05**2, 0.055**2, 0.2**2)
+    quantity = LearnedQuantity(1.0, 0.05**2, 0.055**2, 0.2**2)
     assert 0.07 < quantity.learned(100.0, 250.0).now - 1 < 0.15

@@ -9,7 +9,7 @@ from typing import Any
 
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.estimator.energy_counter import EnergyCounter
-from gz_onboard.estimator.pack_age import Learned
+from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.events import Activity, Estimate, State
 from gz_onboard.log_rows import ESTIMATE_TOPIC, STATUS_TOPIC, declare, estimate_row, learned_row, ride_row
 from tests.support import S
@@ -80,7 +80,10 @@ def write_log(
                 )
                 drawn.add(time, estimate.pack_voltage, estimate.pack_current, distance)
                 log.sample(ESTIMATE_TOPIC, clock(time), estimate_row(estimate))
-                learned = {"capacity": Learned(part.capacity, 0.02, 0.5), "resistance": Learned(1.1, 0.05, 0.5)}
+                learned = {
+                    "capacity": LearnedFactor(part.capacity, 0.02, 0.5),
+                    "resistance": LearnedFactor(1.1, 0.05, 0.5),
+                }
                 row = {"ride": ride_row(estimate, drawn, 20.0, part.rider), "learned": learned_row(learned)}
                 log.sample(STATUS_TOPIC, clock(time), {} if old else row)
         log.close()
