@@ -43,6 +43,7 @@ class Vehicle:
     battery: Battery | None
     model: Model
     riding: PriorRiding
+    correlations: Table  # of parameters, which offline tools read
     range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
     range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
@@ -167,6 +168,7 @@ def read_vehicle(
         battery=read_battery(table, parameters) if "battery" in table.values else None,
         model=model,
         riding=riding,
+        correlations=table.table("correlation"),
         derating=derating,
         range_dbc=_range_dbc(table),
         range_identifier=_range_identifier(table),

@@ -96,7 +96,7 @@ def screen(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Li
         state = "waiting for the scooter"
     km, p10, p90 = (_text(ranges[key], ".1f", "km") for key in ("km", "p10_km", "p90_km"))
     soc, sigma = battery["soc_percent"], battery["soc_sigma_percent"]
-    charged = _text(soc, ".1f", "%") if sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
+    charged = _text(soc, ".1f", "%") if soc is None or sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
     expected, recent = (_text(used[key], ".1f", "Wh/km") for key in ("expected_wh_per_km", "recent_wh_per_km"))
     source = f"{picture['channel']} ({picture['interface']}){'' if picture['bus_up'] else ' is down'}"
     red = soc is not None and soc <= NEARLY_EMPTY

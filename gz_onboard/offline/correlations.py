@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gz_onboard.errors import nearest, shown
-from gz_onboard.toml import Table
 from gz_onboard.vehicle import Vehicle
 
 
 def correlations(vehicle: Vehicle) -> dict[frozenset[str], float]:
     """The correlations in the file of `vehicle`, by the pair of names; InputError for impossible ones."""
     found: dict[frozenset[str], float] = {}
-    known, every = vehicle.parameters, Table.read(vehicle.file).table("correlation")
+    known, every = vehicle.parameters, vehicle.correlations  # of a calibration under way, not of its base file
     for group in every.values:
         table = every.table(group)
         table.only(["parameters", "value", "source"])

@@ -176,7 +176,7 @@ def test_what_the_scooter_does_not_send_is_not_available():
     codec = Codec(reference().mapping)
     seen = set()
     for _, identifier, data, _ in frames()[:5000]:
-        values = codec.values(identifier, data)
+        values = codec.values(database.get_message_by_frame_id(identifier).name, data)
         seen |= absent & set(values)
         assert all(values[name] is None for name in absent & set(values))
         assert database.get_message_by_frame_id(identifier).length == len(data)

@@ -190,11 +190,11 @@ def test_joined_mid_ride_it_knows_what_it_does_not_know(begin: Begin, soc: float
 
 
 def another_pack(state: dict[str, Any]) -> None:
-    state |= {"soc": 0.35, "covariance": [0.005**2, 0.0, 1e-6]}
+    state |= {"soc": 0.35, "soc_variance": 0.005**2}
 
 
 def another_day(state: dict[str, Any]) -> None:
-    state |= {"odometer": state["odometer"] - 40e3, "own_soc": None, "covariance": [0.005**2, 0.0, 1e-6]}
+    state |= {"odometer": state["odometer"] - 40e3, "own_soc": None, "soc_variance": 0.005**2}
 
 
 @pytest.mark.parametrize("wrong", [another_pack, another_day])
@@ -258,7 +258,7 @@ def test_what_a_daemon_has_learned_is_shown_and_forgotten(begin: Begin):
     scooter = Scooter(soc=0.75, capacity=26.0)  # an aged pack
     hours = begin(scooter)
     saved = long_known(hours)
-    saved["learned"]["capacity"] |= {"inverse": 1.25, "variance": 0.01**2}
+    saved["learned"] |= {"inverse_capacity": 1.25, "capacity_variance": 0.01**2, "capacity_with_soc": 0.0}
     file = hours.save(saved)
     daemon = hours.start()
     hours.live(scooter.live(30))
