@@ -86,6 +86,9 @@ class LimitCheck:
         if not self._signals.fix_below(now, FIX_3D):
             climb = MOTION.max_grade * abs(speed or 0.0) + CONFIG.altitude_wander_m_s
             self.altitude.check(climb, climb)
+        for axis in self._axes.values():
+            if axis.signal.reported is not None:
+                axis.time_unchanged(dt, axis.signal.reported)
         self._unchecked += dt
         if self._unchecked < CONFIG.brief_s:
             return
@@ -97,8 +100,8 @@ class LimitCheck:
                 continue
             usual, limit = AXES[role]
             mean.update(dt, value - usual, limit)
-            axis.time_unchanged(dt, value)
-            stuck = moving and axis.unchanged > 2 * CONFIG.brief_s and value != 0.0  # as if simulated
+            # Means of coarse samples can agree for a moment. An axis of exactly 0 is one of a simulated unit.
+            stuck = moving and axis.unchanged > CONFIG.brief_s + CONFIG.faulty_after_s and value != 0.0
             # A mean over less than a third of the time may be that of one bend.
             wrong = stuck or (mean.contradicts and mean.seen > CONFIG.settled_s / 3)
             axis.judge(dt, True if wrong else False if moving else None)
