@@ -168,7 +168,9 @@ class PackAge:
         # A change that is small against the tables' own error is mostly that error (a Wiener filter).
         self.resistance = 1 + change**3 / (change**2 + PRIOR.resistance_sd**2)
         # Of the packs that are as new, no resistance is to be learned.
-        unknown = (1 - self._battery.as_new) * state.covariance[9]
+        # The tables err the same way at one place and temperature, however long a ride is.
+        known = min(state.covariance[9] + PRIOR.resistance_sd**2, AGE.aged_resistance_sd**2)
+        unknown = (1 - self._battery.as_new) * known
         self.resistance_sd = sqrt(unknown + (state.resistance - factor) ** 2)
         self._battery.age(1 / self.belief.inverse, self.resistance)
 
