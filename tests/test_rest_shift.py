@@ -106,7 +106,7 @@ def test_the_filter_reckons_with_it():
             estimator.handle((k + 0.1, 1, (volts, offset[1])))
         assert estimator.filter
         soc[battery is COLD] = estimator.filter.soc
-    assert soc[True] == pytest.approx(0.6, abs=1e-3)
+    assert soc[True] == pytest.approx(0.6, abs=1e-6)
     assert soc[False] < 0.6 - 0.5 * 0.02 / COLD.ocv(0.6)[1]
 
 
