@@ -168,9 +168,7 @@ class PackAge:
         # A change that is small against the tables' own error is mostly that error (a Wiener filter).
         self.resistance = 1 + change**3 / (change**2 + PRIOR.resistance_sd**2)
         # Of the packs that are as new, no resistance is to be learned.
-        # The tables err the same way at one place and temperature, however long a ride is.
-        known = min(state.covariance[9] + PRIOR.resistance_sd**2, AGE.aged_resistance_sd**2)
-        unknown = (1 - self._battery.as_new) * known
+        unknown = (1 - self._battery.as_new) * state.covariance[9]
         self.resistance_sd = sqrt(unknown + (state.resistance - factor) ** 2)
         self._battery.age(1 / self.belief.inverse, self.resistance)
 
@@ -198,9 +196,13 @@ class PackAge:
         factor, sd = 1 / self.belief.inverse, sqrt(self.belief.variance)
         left = min(self.belief.variance, state.covariance[7], self._unknown)
         known = 1 - sqrt(self._proven[0][1]) / AGE.aged_resistance_sd
+        # The filter allows for the tables' error itself; at one place and temperature no ride averages it out.
+        unknown = AGE.aged_resistance_sd**2 - state.covariance[9]
+        by_table = (1 - self._battery.as_new) * min(PRIOR.resistance_sd**2, max(unknown, 0.0))
+        resistance_sd = sqrt(self.resistance_sd**2 + by_table)
         return {
             "capacity": LearnedFactor(factor, sd * factor * factor, 1 - sqrt(left / self._unknown)),
-            "resistance": LearnedFactor(self.resistance, self.resistance_sd, max(known, 0.0)),
+            "resistance": LearnedFactor(self.resistance, resistance_sd, max(known, 0.0)),
         }
 
     # --- learning ---------------------------------------------------------------------------------------------
