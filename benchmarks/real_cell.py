@@ -22,7 +22,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.estimator.battery_priors import PRIOR
-from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage

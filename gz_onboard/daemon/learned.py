@@ -19,7 +19,7 @@ from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.consumption import Habits
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.pack_age import LearnedFactor
-from gz_onboard.estimator.snapshot import check_vehicle
+from gz_onboard.estimator.saved_state import check_vehicle
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle

@@ -74,8 +74,8 @@ def condition(
     residual: float,
     variance: float,
     least_capacity_variance: float,
-) -> tuple[FilterState, float]:
-    """Condition the state on a scalar measurement; returns it with the log-likelihood of the residual.
+) -> FilterState:
+    """Condition the state on a scalar measurement.
 
     slopes: derivatives of the measurement over (soc, error, resistance); residual: measured minus predicted; variance:
     of the measurement's noise. The variance of the inverse capacity stays at `least_capacity_variance` or more, and its
@@ -103,15 +103,14 @@ def condition(
     )
     inverse = state.inverse_capacity + share * kc * residual
     soc, error, resistance = state.soc + kz * residual, state.error + ke * residual, state.resistance + kr * residual
-    after = FilterState(soc, error, inverse, resistance, covariance, state.v1)
-    return after, log_likelihood(residual, total)
+    return FilterState(soc, error, inverse, resistance, covariance, state.v1)
 
 
 class Backend(NamedTuple):
     """The two functions of a filter: `predict` and `condition`, or the reference's."""
 
     predict: Callable[[FilterState, float, float, Noise], FilterState]
-    condition: Callable[[FilterState, tuple[float, float, float], float, float, float], tuple[FilterState, float]]
+    condition: Callable[[FilterState, tuple[float, float, float], float, float, float], FilterState]
 
 
 SCALAR = Backend(predict, condition)

@@ -8,10 +8,11 @@ voltage, or on the state of charge that a rest shows. After a long gap, and wher
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, inf, sqrt
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood, with_wider_soc
@@ -26,13 +27,13 @@ from gz_onboard.estimator.battery_priors import (
     soc_width,
     uncounted_sd,
 )
-from gz_onboard.estimator.cell_effects import LARGEST, CellEffects
+from gz_onboard.estimator.cells import LARGEST, Cell, CellEffects
 from gz_onboard.estimator.pack_age import AGE, LearnedFactor, PackAge
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.plausibility.residual import ResponseGain
 from gz_onboard.estimator.rest import RestDetector
-from gz_onboard.estimator.saved_fields import Each, Number
+from gz_onboard.estimator.saved_state import Each, Number
 from gz_onboard.estimator.signals import TIMING, Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
 from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
@@ -97,22 +98,28 @@ class RidingModel(Protocol):
         """Inputs of effects in the cells, apart from those of the cells themselves."""
 
 
-class Cell(NamedTuple):
-    """The cell model at one state of charge and temperature."""
+class Synchroniser:
+    """Keeps the one that comes first, and interpolates it. `latency` [s]: of the voltage; negative: of the current."""
 
-    ocv: float  # V
-    slope: float  # V, of the open-circuit voltage over SOC
-    r0: float  # ohm
-    r0_slope: float  # ohm
-    r1: float  # ohm
-    time: float  # s, of the RC pair
+    def __init__(self, latency: float) -> None:
+        self.latency = latency
+        self._recent: deque[tuple[float, float, float]] = deque()  # s, V, A of the pack
 
-    @classmethod
-    def of(cls, battery: Battery, soc: float, temperature: float) -> Cell:
-        """The cell of `battery` at `soc` and `temperature` [degC]."""
-        r1 = battery.r1.at(soc, temperature)[0]
-        time = r1 * battery.c1.at(soc, temperature)[0]
-        return cls(*battery.ocv(soc, temperature), *battery.r0.at(soc, temperature), r1, time)
+    def pair(self, now: float, voltage: float, current: float, pause: float) -> tuple[float, float] | None:
+        """(voltage [V], current [A]) of one time; None if not yet, or over a gap longer than `pause` [s]."""
+        recent, then = self._recent, now - abs(self.latency)
+        recent.append((now, voltage, current))
+        if recent[0][0] > then:
+            return None
+        while recent[1][0] <= then:
+            recent.popleft()
+        (t0, v0, i0), (t1, v1, i1) = recent[0], recent[1]
+        if t1 - t0 > pause:
+            return None
+        share = (then - t0) / (t1 - t0)
+        if self.latency > 0:
+            return voltage, i0 + share * (i1 - i0)
+        return v0 + share * (v1 - v0), current
 
 
 class InnovationTest:
@@ -449,7 +456,7 @@ class BatteryPack:
         residual = battery.soc_at(emf, temperature) - state.soc
         soc_variance = (soc_width(battery, emf, sqrt(new), temperature) / 2) ** 2
         least = self.age.least_variance(state, state.soc, cell.slope)
-        state, _ = self._backend.condition(state, (1.0, 0.0, 0.0), residual, soc_variance, least)
+        state = self._backend.condition(state, (1.0, 0.0, 0.0), residual, soc_variance, least)
         self._believed = state = bounded(state)
         self._cell = Cell.of(battery, state.soc, temperature)
         return True
@@ -465,7 +472,7 @@ class BatteryPack:
         for _ in range(PACK.turns):
             h = cell.slope - current * cell.r0_slope
             residual = emf - cell.ocv + cell.r0 * current - h * (state.soc - at) + state.error
-            after, _ = self._backend.condition(state, (h, -1.0, 0.0), residual, variance, least)
+            after = self._backend.condition(state, (h, -1.0, 0.0), residual, variance, least)
             before, at = at, after.soc
             if abs(at - before) < PACK.near:
                 break

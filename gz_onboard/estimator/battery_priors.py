@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.battery_filter import FilterState, condition, with_soc
-from gz_onboard.estimator.sources import CurrentSource
+from gz_onboard.estimator.plausibility.electrical import CurrentSource
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 
@@ -319,7 +319,7 @@ def first_state(
     state = FilterState(soc, 0.0, believed.inverse_capacity, believed.resistance, prior, v1)
     chord = shown_sd / sd  # SOC per volt
     slopes, seen_variance = (1.0, -chord, 0.0), (chord * once_sd) ** 2 + doubt
-    return bounded(condition(state, slopes, shown - soc, seen_variance, least_variance(shown))[0])
+    return bounded(condition(state, slopes, shown - soc, seen_variance, least_variance(shown)))
 
 
 def _is_unused(past: Past, now: Past) -> bool:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
 from gz_onboard.estimator.motion import MOTION
-from gz_onboard.estimator.saved_fields import FINITE, Each, Number, Text
+from gz_onboard.estimator.saved_state import FINITE, Each, Number, Text
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass

@@ -12,18 +12,19 @@ from collections.abc import Mapping, Sequence
 from math import inf, sqrt
 from typing import Any
 
+from gz_onboard.estimator import battery_pack, forecast, pack_age, weakest
 from gz_onboard.estimator.battery_filter import SCALAR, Backend, FilterState
 from gz_onboard.estimator.battery_pack import BatteryPack
+from gz_onboard.estimator.cells import Temperatures
 from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import PresentLoad
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
 from gz_onboard.estimator.plausibility import Plausibility
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.route import RouteForecaster
+from gz_onboard.estimator.saved_state import VERSION, Each, Number, Text, check, check_vehicle
 from gz_onboard.estimator.signals import TIMING, Signals
-from gz_onboard.estimator.snapshot import VERSION, check_snapshot
-from gz_onboard.estimator.sources import CurrentSource, PackReading
-from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
@@ -55,6 +56,16 @@ _LOSS_VARIANCES = [(int(reason), sd * sd) for reason, sd in LOSS_SD.items()]
 _DEGRADING = ~int(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)
 _NO_PACK = int(NO_PACK)
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
+FIELDS = {
+    "version": Number(VERSION, VERSION),
+    "key": Text(10_000),  # compared by `check_vehicle`
+    **battery_pack.FIELDS,
+    "cell_temperature": Number(-50.0, 120.0, optional=True),  # degC
+    "gyro_bias": Each(Number(-MOTION.max_gyro_bias, MOTION.max_gyro_bias), 2),  # rad/s, of roll and yaw rate
+    "riding": forecast.FIELDS,
+    "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
+}
+"""Of the saved state."""
 
 
 class Estimator:
@@ -127,7 +138,7 @@ class Estimator:
         motion.step(now, elapsed)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed, gap=elapsed < dt)
-        temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= self.signals.pause else at_rest)
+        temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= self.signals.pause else None)
         self.pack.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
         self.pack.step(now, dt, self._reading, temperature, motion.speed, self._load)
         self.weakest.step(now, self._reading, temperature, self.pack)
@@ -283,7 +294,9 @@ class Estimator:
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = motion.speed, motion.acceleration, motion.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = motion.lean, motion.yaw_rate, motion.heading
-            self._reading.report(estimate)
+            reading = self._reading
+            estimate.pack_voltage, estimate.pack_current = reading.voltage, reading.current
+            estimate.current_modelled = reading.source is CurrentSource.MODEL
             estimate.innovation = self.pack.test.innovation
         estimate.cell_temperature = self._temperatures.cells
         if filter_ is None:
@@ -348,7 +361,8 @@ class Estimator:
 
         ValueError if it does not fit this vehicle; then parts may have been restored: discard this estimator.
         """
-        check_snapshot(saved, key)
+        check_vehicle(saved, key)
+        check(FIELDS, saved)
         age = age if age is not None and 0 <= age < inf else None  # a clock that was set tells no age
         self.forecaster.restore(saved["riding"])
         self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from gz_onboard.estimator.battery_filter import Backend, Covariance, FilterState, Noise, log_likelihood
+from gz_onboard.estimator.battery_filter import Backend, Covariance, FilterState, Noise
 
 UPPER = np.triu_indices(4)
 
@@ -44,7 +44,7 @@ def condition(
     residual: float,
     variance: float,
     least_capacity_variance: float,
-) -> tuple[FilterState, float]:
+) -> FilterState:
     """See `battery_filter.condition`."""
     ekf, h = _filter_of(state), np.array([[slopes[0], slopes[1], 0.0, slopes[2]]])
     measured = h @ ekf.x + residual
@@ -53,7 +53,7 @@ def condition(
     share = min(max(before - least_capacity_variance, 0.0) / told, 1.0) if told > 0 else 0.0
     ekf.x[2, 0] = state.inverse_capacity + share * (ekf.x[2, 0] - state.inverse_capacity)
     ekf.P[2, 2] = before - share * told
-    return _state_of(ekf, state.v1), log_likelihood(residual, float(ekf.S[0, 0]))
+    return _state_of(ekf, state.v1)
 
 
 FILTERPY = Backend(predict, condition)

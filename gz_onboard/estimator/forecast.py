@@ -18,8 +18,8 @@ from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.consumption import CONSUMPTION, ConsumptionLearner
 from gz_onboard.estimator.load_model import AHEAD, Conditions
 from gz_onboard.estimator.motion import MOTION
-from gz_onboard.estimator.saved_fields import Each, Number
-from gz_onboard.estimator.sources import PackReading
+from gz_onboard.estimator.plausibility.electrical import PackReading
+from gz_onboard.estimator.saved_state import Each, Number
 from gz_onboard.events import Activity, Estimate, Reason
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.drawable import Drawable, cells_ahead, drawable, pack_constants

@@ -25,9 +25,9 @@ from gz_onboard.physics.riding import PriorRiding
 
 if TYPE_CHECKING:
     from gz_onboard.estimator.battery_pack import BatteryPack
+    from gz_onboard.estimator.cells import Temperatures
     from gz_onboard.estimator.motion import Motion, VibrationMonitor
     from gz_onboard.estimator.signals import Signals
-    from gz_onboard.estimator.temperatures import Temperatures
 
 Quantities = dict[str, float]
 """Inputs of effects by name: see `physics.effect.QUANTITIES`."""

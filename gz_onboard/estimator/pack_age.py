@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 from gz_onboard.constants import BENCH_TEMPERATURE, DECILE
 from gz_onboard.estimator.battery_filter import Backend, FilterState, with_soc, with_wider_capacity
 from gz_onboard.estimator.battery_priors import PRIOR, bounded
-from gz_onboard.estimator.saved_fields import Number
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
+from gz_onboard.estimator.saved_state import Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.physics.battery import MOST_SOC_SD, QUICK, Battery
 
 
@@ -254,7 +254,7 @@ class PackAge:
         if not self.is_learning or abs(quick) < AGE.excited:
             return state
         residual = quick_measured - state.resistance * quick
-        state, _ = self._backend.condition(state, (0.0, 0.0, quick), residual, AGE.quick_noise / dt, float("inf"))
+        state = self._backend.condition(state, (0.0, 0.0, quick), residual, AGE.quick_noise / dt, float("inf"))
         state = bounded(state)
         if self._ride:
             square, product = self._ride

@@ -26,9 +26,9 @@ from typing import Any
 
 from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.pack_age import SAME, LearnedFactor
-from gz_onboard.estimator.saved_fields import FINITE, Each, Number
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
+from gz_onboard.estimator.saved_state import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.parameters import Parameters
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator

@@ -15,7 +15,7 @@ from gz_onboard.constants import DECILE
 from gz_onboard.estimator import forecast as forecast_module
 from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.saved_fields import check
+from gz_onboard.estimator.saved_state import check
 from gz_onboard.offline.cooling import LumpedCooling
 from gz_onboard.physics.drawable import cells_ahead, pack_constants
 from gz_onboard.physics.effect import load_effect

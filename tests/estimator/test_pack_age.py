@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from gz_onboard.estimator.battery_filter import SCALAR, FilterState, Noise, condition, predict, with_soc
 from gz_onboard.estimator.battery_priors import bounded
 from gz_onboard.estimator.pack_age import AGE, FIELDS, Belief, PackAge, believe, mixture_variance
-from gz_onboard.estimator.saved_fields import check
-from gz_onboard.estimator.sources import CurrentSource, PackReading
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
+from gz_onboard.estimator.saved_state import check
 from gz_onboard.physics.battery import Battery
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
@@ -82,7 +82,7 @@ def discharge(
         predicted, h = battery.terminal_voltage(state.soc, state.v1, current, WARM)
         error, drop = voltage - predicted, battery.r0.at(state.soc, WARM)[0] * current + state.v1
         least = age.least_variance(state, state.soc, battery.ocv(state.soc)[1])
-        state, _ = condition(state, (h, -1.0, 0.0), error + state.error, 0.005**2 * 2 * ERROR_TIME, least)
+        state = condition(state, (h, -1.0, 0.0), error + state.error, 0.005**2 * 2 * ERROR_TIME, least)
         state = age.load(bounded(state), DT, drop, error)
         age.follow(state, DT)
         step += 1

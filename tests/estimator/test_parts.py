@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from gz_onboard.estimator.battery_pack import PACK, InnovationTest
+from gz_onboard.estimator.battery_pack import PACK, InnovationTest, Synchroniser
 from gz_onboard.estimator.battery_priors import PRIOR, ChargeNoise, VoltageNoise
+from gz_onboard.estimator.plausibility.electrical import CurrentSource
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
-from gz_onboard.estimator.sources import CurrentSource, Synchroniser
 from gz_onboard.events import ROLES, WINDOW, Group, Reason
 from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.physics.parameters import Parameters

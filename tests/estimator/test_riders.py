@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.estimator import forecast
 from gz_onboard.estimator.consumption import CONSUMPTION, Segment
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.saved_fields import check
+from gz_onboard.estimator.saved_state import check
 from gz_onboard.events import Group
 from tests.estimator.life import BATTERY, VEHICLE, estimator
 

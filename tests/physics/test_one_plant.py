@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.battery_pack import Cell
+from gz_onboard.estimator.cells import Cell
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
 from gz_onboard.lab.calibrate.coastdown_run import Coast
 from gz_onboard.lab.calibrate.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures

@@ -6,7 +6,9 @@ Chooses the voltage and current that the battery filter receives.
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import Enum, auto
 from math import hypot, inf, isinf, sqrt
+from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.plausibility.residual import (
@@ -19,12 +21,39 @@ from gz_onboard.estimator.plausibility.residual import (
     share_of_new,
 )
 from gz_onboard.estimator.signals import TIMING, Signal, Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.events import CURRENTS, VOLTAGES
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.sensors import true_current, true_voltage
+
+
+class CurrentSource(Enum):
+    """Where the pack current comes from."""
+
+    PACK = auto()
+    INVERTER = auto()
+    DISPUTED = auto()  # the mean of two that contradict each other
+    MODEL = auto()
+    NONE = auto()
+
+
+class PackReading(NamedTuple):
+    """Voltage [V] and current [A] of the pack; None where no sensor is to be believed."""
+
+    voltage: float | None = None
+    current: float | None = None
+    source: CurrentSource = CurrentSource.NONE
+    reported_current: float | None = None  # A, trusted or not
+    voltage_sd: float = 0.0  # V of a cell
+    current_apart: float | None = None  # A: by so much the two currents differ in the mean; None: only one is known
+    voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
+
+    @property
+    def unmeasured(self) -> bool:
+        """Whether no sensor shows anything of the pack."""
+        return self.voltage is None and self.source in (CurrentSource.MODEL, CurrentSource.NONE)
+
 
 ROAD = "road"
 SOURCES = dict(zip(CURRENTS, (CurrentSource.PACK, CurrentSource.INVERTER), strict=False))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.lab.calibrate import cooling_network
 from gz_onboard.lab.calibrate.cooling import (
     bms_cooling,

@@ -1,4 +1,4 @@
-"""Fields of the saved state: each part of the estimator declares its own with bounds; `check` compares a file."""
+"""The saved state: its vehicle, its version, and its fields, of which each part declares its own with bounds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from gz_onboard.errors import shown
+
+VERSION = 7
+"""Raised with every change of a field; a state of another version is not read."""
 
 
 @dataclass(frozen=True)
@@ -63,3 +66,17 @@ def check(field: Field, saved: object, name: str = "state") -> None:
                 raise ValueError(f"is damaged: {name} has {shown(found)}, not {', '.join(field)}")
             for key, part in field.items():
                 check(part, saved[key], f"{name}.{key}")
+
+
+def check_vehicle(saved: object, key: str) -> None:
+    """ValueError for a snapshot of another version, or of another vehicle than that of `key` (`Vehicle.key`)."""
+    version = saved.get("version") if isinstance(saved, Mapping) else saved
+    if version != VERSION or not isinstance(saved, Mapping):
+        raise ValueError(f"is of version {shown(version)}, not {VERSION}")
+    if saved.get("key") != key:
+        theirs, ours = str(saved.get("key")).split("|"), key.split("|")
+        differs = [
+            f"{shown([part for part in these if part not in others])} {whose}"
+            for these, others, whose in ((theirs, ours, "saved"), (ours, theirs, "in this vehicle file"))
+        ]
+        raise ValueError(f"is of another vehicle, battery or list of effects: {', '.join(differs)}")

@@ -1,22 +1,46 @@
-"""Effects in the cells beside R0 and the RC pair, followed with their memory."""
+"""The cells: their model at one state of charge, the effects in them with their memory, and their temperature."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
-from gz_onboard.constants import MILD
+from gz_onboard.constants import BENCH_TEMPERATURE, MILD
+from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.drawable import pack_constants
 from gz_onboard.physics.effect import QUANTITIES, Port
+from gz_onboard.physics.functions import decay_over, relaxed
 from gz_onboard.physics.model import Model, share_that_ages
+from gz_onboard.physics.parameters import Parameters
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
 FORGOTTEN = 10.0  # s: a current that nobody asked for in so long is followed anew
+CELL_SENSOR_SD_K, CELL_MODEL_SD_K = 1.0, 8.0
 
 
 Supposed = tuple[float, dict[str, float]]
 """When [s], and the states of the effects then."""
+
+
+class Cell(NamedTuple):
+    """The cell model at one state of charge and temperature."""
+
+    ocv: float  # V
+    slope: float  # V, of the open-circuit voltage over SOC
+    r0: float  # ohm
+    r0_slope: float  # ohm
+    r1: float  # ohm
+    time: float  # s, of the RC pair
+
+    @classmethod
+    def of(cls, battery: Battery, soc: float, temperature: float) -> Cell:
+        """The cell of `battery` at `soc` and `temperature` [degC]."""
+        r1 = battery.r1.at(soc, temperature)[0]
+        time = r1 * battery.c1.at(soc, temperature)[0]
+        return cls(*battery.ocv(soc, temperature), *battery.r0.at(soc, temperature), r1, time)
 
 
 class CellEffects:
@@ -80,3 +104,55 @@ class CellEffects:
         """So much time [s] without a load, at a temperature that is not known."""
         if self.states:
             self.step(seconds, 0.0, soc, MILD)
+
+
+class Temperatures:
+    """Remembers the cells' temperature, and how much warmer than the air their heat has made them.
+
+    A temperature that is not measured follows the pack's cooling network (`physics.drawable.pack_constants`), which is
+    exact over any step.
+    """
+
+    def __init__(self, signals: Signals, parameters: Parameters) -> None:
+        self._cell, self._air = signals.cell_temperature, signals.ambient_temperature
+        self._conductance, self._cooling_time = pack_constants(parameters)  # W/K, s
+        self.cells: float | None = None  # degC, the last known
+        self._above_air = 0.0  # K; parked for long they are as cold
+
+    @property
+    def cells_or_bench(self) -> float:
+        """The cells' last temperature [degC], or that of the bench."""
+        return BENCH_TEMPERATURE if self.cells is None else self.cells
+
+    def cells_sd(self, now: float) -> float:
+        """Standard deviation of the cells' temperature [K]."""
+        return CELL_SENSOR_SD_K if self._cell.fresh(now) else CELL_MODEL_SD_K
+
+    def ambient(self, now: float) -> float:
+        """The ambient temperature [degC]: measured; else by the cells'; else a mild day's."""
+        ambient = self._air.get(now)
+        if ambient is not None:
+            return ambient
+        if self.cells is not None and self._cell.fresh(now):
+            return self.cells - self._above_air
+        return MILD
+
+    def step(self, now: float, dt: float, heat: Callable[[float], float] | None) -> float:
+        """The cells' temperature [degC]: measured; else it follows from the last one, or the air's, by their heat.
+
+        heat: of the pack [W] over `dt` [s] by its temperature [degC]; None: it had no load.
+        """
+        measured, air, ambient = self._cell.get(now), self._air.get(now), self.ambient(now)
+        unknown = self.cells is None
+        before = measured if measured is not None else ambient + self._above_air if self.cells is None else self.cells
+        above = self._above_air if measured is not None else before - ambient
+        watts = heat(before) if heat else 0.0
+        above = relaxed(above, watts / self._conductance, decay_over(dt, self._cooling_time))
+        if measured is not None:
+            self.cells, self._above_air = measured, above if air is None else measured - air
+            return measured
+        if unknown:  # the heat is all that is known of them
+            self._above_air = above
+        else:
+            self.cells = ambient + above
+        return ambient + above
