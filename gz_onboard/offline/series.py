@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from gz_onboard.arrays import Array
 from gz_onboard.physics.battery import HALF_FULL, Battery, reversible_heat
-from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.effect import QUANTITIES, Equation
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear, sqrt
 from gz_onboard.physics.model import STOOD, Bound, Recall
 
@@ -117,12 +117,10 @@ def stepper(effects: Sequence[Bound], dt: float | None, booked: bool = False) ->
     scope: dict[str, Any] = {"dt": dt}
     lines = []
     for i, bound in enumerate(effects):
-        term, decay = bound.effect.term, bound.effect.decay
-        call = term.source(f"term{i}")
-        scope |= term.scope(f"term{i}", bound.values)
+        decay = bound.effect.decay
+        call = _call(bound.effect.term, bound.values, f"term{i}", scope)
         if decay and dt is not None:
-            scope |= {f"value{i}": 0.0} | decay.scope(f"decay{i}", bound.values)
-            kept = decay.source(f"decay{i}")
+            scope[f"value{i}"], kept = 0.0, _call(decay, bound.values, f"decay{i}", scope)
             if bound.has_fixed_time:
                 scope[f"kept{i}"], kept = bound.decay(dt, {}), f"kept{i}"
             lines += [f"global value{i}", f"k = {kept}"]
@@ -136,14 +134,16 @@ def stepper(effects: Sequence[Bound], dt: float | None, booked: bool = False) ->
     return scope["values"]  # type: ignore[no-any-return]
 
 
-def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
-    """The value of `effect`; with memory, as `recall` gives it, or settled without `recall`."""
-    return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
+def _call(equation: Equation, values: Mapping[str, float], label: str, scope: dict[str, Any]) -> str:
+    """Source of a call of `equation` with quantities from ``q`` and with ``dt``; what it names is added to `scope`."""
+    scope |= {label: equation.function} | {f"{label}_{name}": values[name] for name in equation.parameters}
+    quantities = [name if name == "dt" else f"q[{name!r}]" for name in equation.quantities]
+    return f"{label}({', '.join([*quantities, *(f'{name}={label}_{name}' for name in equation.parameters)])})"
 
 
 def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
-    """The sum of the values of `effects`: see `value_of`."""
-    return sum((value_of(effect, quantities, recall) for effect in effects), 0.0)
+    """The sum of the values of `effects`: see `Bound`."""
+    return sum((effect(quantities, recall) for effect in effects), 0.0)
 
 
 def soc_at_load(battery: Battery, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:

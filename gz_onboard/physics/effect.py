@@ -40,7 +40,7 @@ import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -198,27 +198,11 @@ class Equation:
         """The value."""
         return self.function(*quantities, **parameters)
 
-    def source(self, label: str) -> str:
-        """Python source of a call with quantities from a dictionary ``q``, ``dt`` and the names of `scope`."""
-        quantities = [name if name == "dt" else f"q[{name!r}]" for name in self.quantities]
-        return f"{label}({', '.join([*quantities, *(f'{name}={label}_{name}' for name in self.parameters)])})"
-
-    def scope(self, label: str, values: Mapping[str, float]) -> dict[str, Any]:
-        """The function and the `values` of its parameters under names that begin with `label`, for `source`."""
-        return {label: self.function} | {f"{label}_{name}": values[name] for name in self.parameters}
-
     def bound(self, values: Mapping[str, float]) -> Callable[..., Any]:
-        """The equation with these `values` of its parameters, as a function of quantities by name, and of ``dt`` [s].
-
-        It is written out as source: loops over names would take several times as long, and it runs in each step.
-        """
-        return _binder(self)(*self.scope("call", values).values())
-
-
-@cache
-def _binder(equation: Equation) -> Callable[..., Callable[..., Any]]:
-    names = equation.scope("call", dict.fromkeys(equation.parameters, 0.0))
-    return eval(f"lambda {', '.join(names)}: lambda q, dt=0.0: {equation.source('call')}")  # type: ignore[no-any-return]
+        """A function of quantities by name, and of ``dt`` [s] for a decay, with these `values` of the parameters."""
+        call = partial(self.function, **{name: values[name] for name in self.parameters})
+        names = [name for name in self.quantities if name != "dt"]
+        return lambda q, *dt: call(*dt, *[q[name] for name in names])
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,14 @@ Backward in the sense of simulation (speed in, power out); of floats and numpy a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping
 from math import sqrt
 from typing import Any
 
 from gz_onboard.constants import KELVIN
 from gz_onboard.physics.battery import QUICK, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Effect, Port
-from gz_onboard.physics.functions import STANDSTILL, mean_response, relaxed
+from gz_onboard.physics.functions import STANDSTILL, mean_response
 from gz_onboard.physics.parameters import Parameters
 
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
@@ -27,14 +27,13 @@ def air_density(temperature: float, altitude: float = 0.0) -> float:
 class Bound:
     """An effect with the values of its parameters.
 
-    term: its value as a function of quantities by name, floats or arrays; of an effect with memory, the value at which
-    it settles. has_fixed_time: nothing but its parameters decides how fast it settles.
+    has_fixed_time: nothing but its parameters decides how fast it settles.
     """
 
     def __init__(self, effect: Effect, parameters: Mapping[str, float]) -> None:
         self.effect = effect
         self.values = {name: parameters[name] for name in effect.takes}
-        self.term = effect.term.bound(self.values)
+        self._term = effect.term.bound(self.values)
         self._decay = effect.decay and effect.decay.bound(self.values)
         self.has_fixed_time = effect.decay is None or effect.decay.quantities == ("dt",)
 
@@ -42,9 +41,9 @@ class Bound:
         """Pickle effect and values: another process does not know the functions of a user's file."""
         return Bound, (self.effect, self.values)
 
-    def __call__(self, quantities: Mapping[str, Any]) -> Any:
-        """See `term`."""
-        return self.term(quantities)
+    def __call__(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
+        """Its value at `quantities` by name, floats or arrays; with memory as `recall` gives it, by default settled."""
+        return recall(self, quantities) if recall and self._decay else self._term(quantities)
 
     def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
         """The factor by which its state decays over `dt` [s]; 0 for an effect without memory."""
@@ -52,7 +51,8 @@ class Bound:
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
         """Its value `dt` [s] after `state`."""
-        return float(relaxed(state, self.term(quantities), self.decay(dt, quantities)))
+        decay = self.decay(dt, quantities)
+        return float(decay * state + (1 - decay) * self._term(quantities))
 
 
 Recall = Callable[[Bound, Mapping[str, Any]], Any]
@@ -75,27 +75,6 @@ def drag_torque(power: Any, motor_speed: Any) -> Any:
     return power * motor_speed / (motor_speed * motor_speed + STANDSTILL * STANDSTILL)
 
 
-class EffectGroup:
-    """The values of some effects at once. settled: all of them, in order, with no memory."""
-
-    def __init__(self, effects: Sequence[Bound]) -> None:
-        self.names = [bound.effect.name for bound in effects]
-        scope: dict[str, Any] = {}
-        for i, bound in enumerate(effects):
-            scope |= bound.effect.term.scope(f"term{i}", bound.values)
-        calls = "".join(f"{bound.effect.term.source(f'term{i}')}, " for i, bound in enumerate(effects))
-        self.settled: Callable[[Mapping[str, Any]], tuple[Any, ...]] = eval(f"lambda q: ({calls})", scope)
-        self._with_memory = [(i, bound) for i, bound in enumerate(effects) if bound.effect.decay]
-
-    def at(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> Sequence[Any]:
-        """The values in order; of those with memory as `recall` gives them, or settled without `recall`."""
-        values = self.settled(quantities)
-        if recall is None or not self._with_memory:
-            return values
-        recalled = {i: recall(bound, quantities) for i, bound in self._with_memory}
-        return [recalled.get(i, value) for i, value in enumerate(values)]
-
-
 class Model:
     """The effects of one vehicle with its parameters. reads: the quantities that the effects need."""
 
@@ -105,15 +84,11 @@ class Model:
         self.reads: frozenset[str] = frozenset().union(*(effect.reads for effect in effects))
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
         self._bound = [Bound(effect, parameters) for effect in effects]
-        self._road, self._motor = EffectGroup(self.at(*ROAD_LOAD)), EffectGroup(self.at(Port.MOTOR_LOSS))
-        self._electric = EffectGroup(self.at(Port.INVERTER_LOSS, Port.DC_POWER))
+        self._road, self._motor = self.at(*ROAD_LOAD), self.at(Port.MOTOR_LOSS)
+        self._electric = self.at(Port.INVERTER_LOSS, Port.DC_POWER)
         self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
         self._regeneration_limit = parameters["regeneration_torque_limit"]
         self._torque_constant = parameters["torque_constant"]
-
-    def __reduce__(self) -> tuple[type[Model], tuple[tuple[Effect, ...], Parameters]]:
-        """Pickle effects and parameters: another process does not know the functions made of them."""
-        return Model, (self.effects, self.parameters)
 
     def at(self, *ports: Port) -> list[Bound]:
         """The effects at these ports."""
@@ -121,7 +96,8 @@ class Model:
 
     def idle_loss(self, quantities: Mapping[str, Any]) -> Any:
         """Loss of the motor [W] turning without current: drag on the shaft, which the motor's current makes up for."""
-        return sum(self._motor.settled({**quantities, "torque": 0.0, "motor_current": 0.0}))
+        q = {**quantities, "torque": 0.0, "motor_current": 0.0}
+        return sum([effect(q) for effect in self._motor])
 
     def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
         """The ledger [W]: the power that each effect takes out of the pack, by name, moving as `quantities` say.
@@ -133,18 +109,18 @@ class Model:
         energy are the entries ``inertia`` and ``grade_force``.
         """
         q = dict(quantities)
-        speed, road = q["speed"], self._road.at(q, recall)
-        ledger = {name: force * speed for name, force in zip(self._road.names, road, strict=True)}
+        speed, road = q["speed"], [effect(q, recall) for effect in self._road]
+        ledger = {bound.effect.name: force * speed for bound, force in zip(self._road, road, strict=True)}
         motor_speed = speed * self._motor_per_speed
         wanted = sum(road) / self._motor_per_speed  # torque at the motor's shaft
         limit = -self._regeneration_limit
         torque = (wanted + limit + abs(wanted - limit)) / 2  # the greater of both, for arrays too
         ledger["brakes"] = (torque - wanted) * motor_speed
         q["motor_speed"], q["torque"], q["motor_current"] = motor_speed, 0.0, 0.0
-        q["torque"] = torque + drag_torque(sum(self._motor.settled(q)), motor_speed)
+        q["torque"] = torque + drag_torque(sum([effect(q) for effect in self._motor]), motor_speed)
         q["motor_current"] = q["torque"] / self._torque_constant
-        ledger.update(zip(self._motor.names, self._motor.at(q, recall), strict=True))
-        ledger.update(zip(self._electric.names, self._electric.at(q, recall), strict=True))
+        for bound in (*self._motor, *self._electric):
+            ledger[bound.effect.name] = bound(q, recall)
         return ledger
 
     def overpotential(self, battery: Battery, others: Mapping[str, float] | None = None) -> Overpotential | None:
@@ -152,7 +128,10 @@ class Model:
 
         others: quantities that are not the cells' and that the effects may read; 0 if not given.
         """
-        effects = [(x, x.term, _share_of_bursts(x), share_that_ages(x)) for x in self.at(Port.CELL_VOLTAGE)]
+        effects = []
+        for effect in self.at(Port.CELL_VOLTAGE):
+            share = mean_response(effect.decay(BURST, {})) if effect.has_fixed_time else None  # of a burst, in its mean
+            effects.append((effect, share, share_that_ages(effect)))
         if not effects:
             return None
         q, health = dict.fromkeys(QUANTITIES, 0.0) | dict(others or {}), battery.health
@@ -161,13 +140,13 @@ class Model:
             q["soc"], q["cell_temperature"] = soc, temperature
             q["cell_capacity"] = battery.cell_capacity(temperature)
             aged, lost = health.resistance - 1, 0.0
-            for effect, term, known, ages in effects:
+            for effect, known, ages in effects:
                 q["cell_current"] = load = (1 + aged * ages) * current
                 share = 0.0
                 if form_factor_squared > 1:
                     share = mean_response(effect.decay(BURST, q)) if known is None else known
                 if share < UNMOVED:
-                    lost += term(q)
+                    lost += effect(q)
                     continue
                 # The charge flows in bursts. An effect that is fast enough follows the current, not its mean. A gamma
                 # distribution of currents of this form factor, weighted with the charge, has the mean and sd of two
@@ -175,9 +154,9 @@ class Model:
                 bursts = 1 + (form_factor_squared - 1) * share
                 apart = sqrt((bursts - 1) / bursts)
                 q["cell_current"] = (1 - apart) * bursts * load
-                low = term(q)
+                low = effect(q)
                 q["cell_current"] = (1 + apart) * bursts * load
-                lost += (low + term(q)) / 2
+                lost += (low + effect(q)) / 2
             return lost
 
         return settled
@@ -189,11 +168,6 @@ BURST = 10.0  # s: a load in traffic
 UNMOVED = 0.01  # an effect that shows less of a burst sees only the mean current
 STOOD = 60.0  # s: duration of the load before a ride's first voltages: lights, a heater
 STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
-
-
-def _share_of_bursts(effect: Bound) -> float | None:
-    """How much of a burst an effect in the cells shows in the mean over it; None if the cells' state decides."""
-    return mean_response(effect.decay(BURST, {})) if effect.has_fixed_time else None
 
 
 def share_that_ages(effect: Bound) -> float:

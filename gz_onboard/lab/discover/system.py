@@ -10,7 +10,7 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
-from gz_onboard.offline.series import series, value_of
+from gz_onboard.offline.series import series
 from gz_onboard.offline.traits import traits
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
@@ -53,7 +53,7 @@ class System:
             if effect.port not in ports or effect.stores_energy:
                 continue
             known = self._known(q, effect)
-            value = value_of(Bound(effect, p), known, recall)
+            value = Bound(effect, p)(known, recall)
             if variation := traits(effect).variation:
                 healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
                 value = value * variation.bound({**p, **healthy})(known)
