@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from dataclasses import dataclass
 from math import exp, inf, sqrt
 from typing import Any, NamedTuple
 
@@ -85,8 +85,7 @@ class ConsumptionConfig:
 CONSUMPTION = ConsumptionConfig()
 
 
-@dataclass(frozen=True, slots=True)
-class LearnedQuantity:
+class LearnedQuantity(NamedTuple):
     """A quantity of the riding: Kalman filter of a slow level and a faster deviation of the present ride from it.
 
     The level is a random walk over metres, the deviation a first-order Gauss-Markov process (Ornstein-Uhlenbeck) that
@@ -98,13 +97,9 @@ class LearnedQuantity:
     level_variance: float
     ride_variance: float  # of the deviation, from ride to ride
     scatter: float  # variance of one segment
-    deviation: float = 0.0
-    deviation_variance: float = -1.0  # negative: as from ride to ride
+    deviation: float
+    deviation_variance: float
     covariance: float = 0.0  # of level and deviation
-
-    def __post_init__(self) -> None:
-        if self.deviation_variance < 0:
-            object.__setattr__(self, "deviation_variance", self.ride_variance)
 
     @property
     def now(self) -> float:
@@ -158,18 +153,17 @@ class LearnedQuantity:
         c = CONSUMPTION
         seen = self.deviation**2 + self.deviation_variance
         ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
-        return LearnedQuantity(
-            self.level, self.level_variance, min(max(ride_variance, c.least_sd**2), c.most_variance), self.scatter
-        )
+        ride_variance = min(max(ride_variance, c.least_sd**2), c.most_variance)
+        return LearnedQuantity(self.level, self.level_variance, ride_variance, self.scatter, 0.0, ride_variance)
 
     def doubted(self, seen: float) -> LearnedQuantity:
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
         more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
-        return replace(self, deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
+        return self._replace(deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
 
     def scaled(self, by: float) -> LearnedQuantity:
         """The same quantity in a unit that is `by` times smaller."""
-        return LearnedQuantity(*(x * by**power for x, power in zip(astuple(self), (1, 2, 2, 2, 1, 2, 2), strict=True)))
+        return LearnedQuantity(*(x * by**power for x, power in zip(self, (1, 2, 2, 2, 1, 2, 2), strict=True)))
 
 
 class Habits(NamedTuple):
@@ -188,7 +182,10 @@ class Habits(NamedTuple):
         levels = prior.factor, stops, 1.0, prior.factor
         sds = price_sd, c.stops_sd, c.pace_sd, (prior.factor_sd, *c.factor_sd)
         return cls(
-            *(LearnedQuantity(level, *(sd * sd for sd in each)) for level, each in zip(levels, sds, strict=True))
+            *(
+                LearnedQuantity(level, sd * sd, ride * ride, segment * segment, 0.0, ride * ride)
+                for level, (sd, ride, segment) in zip(levels, sds, strict=True)
+            )
         )
 
     def next_ride(self) -> Habits:
@@ -239,8 +236,7 @@ class Second:
     climb: float = 0.0  # m
 
 
-@dataclass(frozen=True, slots=True)
-class Terrain:
+class Terrain(NamedTuple):
     """How far roads climb or fall in the end, where no route tells the hills ahead.
 
     A hill gives its energy back, but for losses, which are part of the price of a metre. The height at which a way
@@ -308,25 +304,25 @@ class AuxiliaryPower:
         self.now = self.mean = self.seen = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class RidingState:
+class RidingState(NamedTuple):
     """State of the learner at the end of a segment."""
 
     habits: Habits
-    sums: Segment = field(default_factory=Segment)  # faded over `memory_m`
-    recent: Segment = field(default_factory=Segment)  # faded over `recent_m`
+    sums: Segment = Segment()  # faded over `memory_m`
+    recent: Segment = Segment()  # faded over `recent_m`
     terrain: Terrain = Terrain()
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedRiding:
-    """The riding to come."""
+class ExpectedRiding(NamedTuple):
+    """The riding to come, and how much of it was ridden."""
 
     consumption: float  # J/m
     power: float  # W, mean
     form_factor_squared: float  # mean square of the power over the square of its mean
     variance: float  # of the consumption over the way to come, relative
     least: float  # J/m: no riding takes less
+    recent: float | None  # J/m: over about the last kilometre, stops included; None: too short a way
+    mostly_prior: bool  # less was ridden than the prior riding counts for
 
 
 class ConsumptionLearner:
@@ -380,19 +376,6 @@ class ConsumptionLearner:
         """How much of the expected price the riding has taught, rather than the prior: 0 to 1."""
         return min(max(1 - self.habits.price.variance / self.prior.price.variance, 0.0), 1.0)
 
-    @property
-    def recent_consumption(self) -> float | None:
-        """Consumption over about the last kilometre, stops included [J/m]; None: too short a way."""
-        recent, now = self.state.recent, self._segment
-        if self.state.sums.distance + now.distance < CONSUMPTION.recent_m / 2:
-            return None
-        return (recent.energy + now.energy) / (recent.distance + now.distance)
-
-    @property
-    def mostly_prior(self) -> bool:
-        """Whether less was ridden than the prior riding counts for."""
-        return self.state.sums.distance + self._segment.distance < CONSUMPTION.prior_m
-
     def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
         """The riding on the next `way` [m]; ambient in degC, altitude in m."""
         c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed
@@ -414,12 +397,16 @@ class ConsumptionLearner:
         squares = c.form_factor_squared * prior_power**2 * prior_time + sums.squares
         low, high = c.form_factor_squared_limits
         variance = ((price_variance + stops_variance) * unit**2 + pace_variance * extra**2) / consumption**2
+        recent, now = self.state.recent, self._segment
+        ridden, lately = sums.distance + now.distance, recent.distance + now.distance
         return ExpectedRiding(
             consumption,
             consumption * speed / pace,
             min(max(squares * (prior_time + sums.duration) / energy**2, low), high),
             variance + height_variance,
-            least=c.least_price * unit,
+            c.least_price * unit,
+            None if ridden < c.recent_m / 2 else (recent.energy + now.energy) / lately,
+            ridden < c.prior_m,
         )
 
     # --- learning -----------------------------------------------------------------------------------------------
@@ -560,7 +547,7 @@ class ConsumptionLearner:
         self.pause()
         self._revert(distance)
         doubted = (mine.doubted(its.now) for mine, its in zip(self.habits, seen, strict=True))
-        self.state = replace(self.state, habits=Habits(*doubted))
+        self.state = self.state._replace(habits=Habits(*doubted))
 
     def ridden_by(self, rider: str) -> None:
         """Have `rider` ride from now on.
@@ -574,7 +561,7 @@ class ConsumptionLearner:
         habits = self.other_riders.pop(rider, None)
         if habits is None:
             price, pace = (
-                replace(x, level_variance=x.level_variance + CONSUMPTION.level_sd**2)
+                x._replace(level_variance=x.level_variance + CONSUMPTION.level_sd**2)
                 for x in (before.price, before.pace)
             )
             habits = before._replace(price=price, pace=pace)
@@ -593,7 +580,7 @@ class ConsumptionLearner:
         riding, self.still = self.still < CONSUMPTION.ride_ends_s, self.still + dt
         if riding and self.still >= CONSUMPTION.ride_ends_s:
             self.rides += 1
-            self.state = replace(self.state, habits=self.habits.next_ride())
+            self.state = self.state._replace(habits=self.habits.next_ride())
         if self.still >= CONSUMPTION.tyres_cool_s:
             self.load.time_moving = 0.0
 
@@ -607,7 +594,7 @@ class ConsumptionLearner:
                 "habits": _saved(self.habits),
                 "sums": self.state.sums._asdict(),
                 "recent": self.state.recent._asdict(),
-                "terrain": asdict(self.state.terrain),
+                "terrain": self.state.terrain._asdict(),
             },
             "rider": self.rider,
             "riders": {name: _saved(habits) for name, habits in self.other_riders.items()},
@@ -637,7 +624,7 @@ class ConsumptionLearner:
 
 
 def _saved(habits: Habits) -> dict[str, dict[str, float]]:
-    return {name: asdict(quantity) for name, quantity in habits._asdict().items()}
+    return {name: quantity._asdict() for name, quantity in habits._asdict().items()}
 
 
 def _restored(saved: Mapping[str, Mapping[str, float]], price: float, pace: float) -> Habits:
@@ -645,14 +632,14 @@ def _restored(saved: Mapping[str, Mapping[str, float]], price: float, pace: floa
     scales = {"price": price, "stops": price, "pace": pace, "factor": price}
     habits = Habits(**{name: LearnedQuantity(**quantity).scaled(scales[name]) for name, quantity in saved.items()})
     for q in habits:
-        possible = q.level >= 0 and all(abs(x) <= CONSUMPTION.most for x in astuple(q))
+        possible = q.level >= 0 and all(abs(x) <= CONSUMPTION.most for x in q)
         possible &= min(q.ride_variance, q.level_variance, q.deviation_variance) >= 0 < q.scatter
         if not possible or q.covariance**2 > q.level_variance * q.deviation_variance * (1 + 1e-9):
             raise ValueError("is damaged: state.riding holds implausible habits")
     return habits
 
 
-_HABITS = {name: {f.name: FINITE for f in fields(LearnedQuantity)} for name in Habits._fields}
+_HABITS = {name: dict.fromkeys(LearnedQuantity._fields, FINITE) for name in Habits._fields}
 _POSITIVE, _ANY = Number(0.0, 1e12), Number(-1e12, 1e12)
 _SIGNED = "measured", "stops", "auxiliary", "modelled", "level", "climb"
 _SUMS = dict.fromkeys(Segment._fields, _POSITIVE) | dict.fromkeys(_SIGNED, _ANY)
@@ -662,7 +649,7 @@ FIELDS = {
         "habits": _HABITS,
         "sums": _SUMS,
         "recent": _SUMS,
-        "terrain": {f.name: _POSITIVE for f in fields(Terrain)} | {"climb": _ANY},
+        "terrain": dict.fromkeys(Terrain._fields, _POSITIVE) | {"climb": _ANY},
     },
     "rider": Text(CONSUMPTION.most_name_letters),
     "riders": Each(_HABITS, CONSUMPTION.most_riders),

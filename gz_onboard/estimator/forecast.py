@@ -8,7 +8,7 @@ is charged, the forecaster says when it will be full.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil, exp, hypot, inf, log, sqrt
 from typing import Any, NamedTuple
 
@@ -80,8 +80,7 @@ def deciles(energy: float, down: float, up: float, variance: float) -> tuple[flo
     return p10, energy * exp(hypot(spread, log(1 + DECILE * up / energy)))
 
 
-@dataclass(frozen=True)
-class Forecast:
+class Forecast(NamedTuple):
     """Range and the quantities it follows from; SI units."""
 
     range: float
@@ -292,8 +291,8 @@ class Forecaster:
             energy_sd_up=up,
             consumption=price,
             consumption_sd=price * sqrt(variance),
-            recent=learner.recent_consumption,
-            mostly_prior=learner.mostly_prior,
+            recent=expected.recent,
+            mostly_prior=expected.mostly_prior,
             power=exp(discharge.inputs[4]),  # that the energy was computed for
             form_factor_squared=discharge.inputs[5],
             cells=discharge.cells,
@@ -310,7 +309,7 @@ class Forecaster:
                 energy = last.left.energy + last.left.slope * moved[0]
                 if sd := last.inputs[2]:
                     energy += FORECAST.cells_stay * last.lost_colder / sd * moved[1]
-                return last._replace(left=replace(last.left, energy=energy))
+                return last._replace(left=last.left._replace(energy=energy))
         soc, temperature, sd, ambient, log_power, form_factor_squared = now
         load = exp(log_power), form_factor_squared
         cells = cells_ahead(self.battery, self.cooling, (soc, temperature), ambient, load, self._overpotential)
@@ -402,7 +401,7 @@ class Forecaster:
         ridden, self._shown_at = learner.distance - self._shown_at, learner.distance
         way = self.smoother.follow(forecast.range, forecast.energy, forecast.known_from, ridden, drawn)
         below = sqrt(forecast.p10 / forecast.range) if forecast.range else 0.0
-        return replace(forecast, range=way, p10=min(forecast.p10, way * below), p90=max(forecast.p90, way))
+        return forecast._replace(range=way, p10=min(forecast.p10, way * below), p90=max(forecast.p90, way))
 
     def snapshot(self) -> dict[str, Any]:
         """State to be kept over a restart."""

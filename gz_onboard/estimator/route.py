@@ -18,7 +18,7 @@ says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from math import cos, exp, inf, pi, radians, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -439,8 +439,7 @@ class RouteForecaster:
         self.hills = route.between(costs.height, here, here + within), within
         expected = free.energy / range_ if range_ > 0 and free.energy > 0 else free.consumption
         known_from = config.segment_m * config.segment_sd**2 / self.variance  # riding that would tell as much
-        return replace(
-            free,
+        return free._replace(
             range=range_,
             p10=reach(low),
             p90=reach(high),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import exp, sqrt
+from typing import NamedTuple
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential, WeakGroup
@@ -34,8 +35,7 @@ HOT_CELLS_C = 50.0  # degC: vehicles limit the power of hotter cells
 DIGITS = 1  # of the result [degC]: rows of tables at it are kept for seconds; 0.1 K is 0.05 % of the energy
 
 
-@dataclass(frozen=True)
-class Drawable:
+class Drawable(NamedTuple):
     """Energy that a pack still delivers, and its sensitivities."""
 
     energy: float  # J, at the pack's terminals

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,13 +18,18 @@ from gz_onboard.vehicle import read_vehicle
 VEHICLE = read_vehicle("reference", 75.0)
 
 
+def quantity_of(level_sd, ride_sd, segment_sd):
+    """A quantity near 1 of which nothing is learned yet."""
+    return LearnedQuantity(1.0, level_sd**2, ride_sd**2, segment_sd**2, deviation=0.0, deviation_variance=ride_sd**2)
+
+
 def test_a_quantity_knows_how_well_it_knows():
     """Rides drawn from its own model: the errors of what it expects have the variance that it states."""
     rng = np.random.default_rng(1)
     normalised = []
     for _ in range(150):
         usual = rng.normal(1.0, 0.15)
-        quantity = LearnedQuantity(1.0, 0.15**2, 0.06**2, 0.2**2)
+        quantity = quantity_of(0.15, 0.06, 0.2)
         for _ in range(6):
             level = usual + rng.normal(0, 0.06)
             for _ in range(20):
@@ -38,7 +42,7 @@ def test_a_quantity_knows_how_well_it_knows():
 
 def test_a_quantity_learns_how_unlike_rides_are():
     rng = np.random.default_rng(2)
-    quantity = LearnedQuantity(1.0, 0.15**2, 0.05**2, 0.1**2)
+    quantity = quantity_of(0.15, 0.05, 0.1)
     for _ in range(60):
         level = 0.9 + rng.normal(0, 0.12)
         for _ in range(24):
@@ -67,7 +71,7 @@ def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before,
     rng = np.random.default_rng(3)
     found = []
     for _ in range(80):
-        quantity, smoother = LearnedQuantity(1.0, 0.17**2, 0.055**2, 0.2**2), RangeSmoother()
+        quantity, smoother = quantity_of(0.17, 0.055, 0.2), RangeSmoother()
         for k in range(4 * 70):
             quantity = quantity.learned((1.0 if k < 4 * before else 1.2) + rng.normal(0, 0.17) - quantity.now, 250.0)
             left = 100_000 - 250.0 * k  # as though it lasted for long
@@ -87,14 +91,14 @@ ANY = st.floats(-1e9, 1e9)
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(ANY, st.floats(1.0, 1e5), st.floats(0.0, 1e12)), min_size=1, max_size=60), st.integers(1, 40))
 def test_whatever_was_learned_can_be_restored(segments, repeats):
-    quantity = LearnedQuantity(1.0, 0.15**2, 0.055**2, 0.2**2)
+    quantity = quantity_of(0.15, 0.055, 0.2)
     for i, (residual, distance, noise) in enumerate(segments * repeats):
         quantity = quantity.learned(residual, distance, noise)
         if i % 7 == 6:
             quantity = quantity.next_ride()
     prior = Habits.before(PriorRiding(), 0.02)
     learner = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
-    learner.state = replace(learner.state, habits=Habits(quantity, prior.stops, prior.pace, quantity))
+    learner.state = learner.state._replace(habits=Habits(quantity, prior.stops, prior.pace, quantity))
     again = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
     again.restore(json.loads(json.dumps(learner.snapshot())))
     assert again.habits == learner.habits
@@ -118,11 +122,11 @@ def fresh():
 def test_recent_consumption_is_that_of_about_the_last_kilometre():
     learner = fresh()
     steady(learner, 390, 500.0)
-    assert learner.recent_consumption is None
+    assert learner.expected(30e3, 20.0, 0.0).recent is None
     steady(learner, 5000, 500.0)
-    assert learner.recent_consumption == pytest.approx(50.0)
+    assert learner.expected(30e3, 20.0, 0.0).recent == pytest.approx(50.0)
     steady(learner, 1000, 900.0)
-    assert learner.recent_consumption == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
+    assert learner.expected(30e3, 20.0, 0.0).recent == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
 
 
 def test_bursts_are_expected_from_about_the_last_twelve_kilometres():
@@ -143,8 +147,9 @@ def test_before_much_is_ridden_bursts_are_those_of_the_prior_riding():
     learner = fresh()
     assert learner.expected(30e3, 20.0, 0.0).form_factor_squared == pytest.approx(2.5)
     steady(learner, 3000, 800.0)
-    assert 1.5 < learner.expected(30e3, 20.0, 0.0).form_factor_squared < 2.0
-    assert not learner.mostly_prior or learner.state.sums.distance < 3000
+    expected = learner.expected(30e3, 20.0, 0.0)
+    assert 1.5 < expected.form_factor_squared < 2.0
+    assert not expected.mostly_prior or learner.state.sums.distance < 3000
 
 
 @pytest.mark.parametrize(("change", "taken"), [(10.0, True), (20.0, False)])
@@ -158,5 +163,5 @@ def test_a_second_that_accelerates_as_no_road_allows_is_left_out(change, taken):
 
 def test_a_segment_that_no_riding_explains_counts_for_little():
     """A ferry queue that costs a hundred times the price moves it by a tenth."""
-    quantity = LearnedQuantity(1.0, 0.05**2, 0.055**2, 0.2**2)
+    quantity = quantity_of(0.05, 0.055, 0.2)
     assert 0.07 < quantity.learned(100.0, 250.0).now - 1 < 0.15

@@ -377,13 +377,13 @@ def test_the_interval_encloses_the_newest_forecast_and_the_displayed_range():
     f = forecaster()
     f.shown(forecast(f))
     f.learner.distance += 10.0
-    better = replace(
-        forecast(f), range=1.5 * forecast(f).range, p10=1.4 * forecast(f).range, p90=1.6 * forecast(f).range
+    better = forecast(f)._replace(
+        range=1.5 * forecast(f).range, p10=1.4 * forecast(f).range, p90=1.6 * forecast(f).range
     )
     shown = f.shown(better)
     assert shown.range < 1.4 * forecast(f).range
     assert 0.9 * shown.range < shown.p10 < shown.range < shown.p90 == better.p90
-    worse = replace(better, range=0.5 * better.range, p10=0.4 * better.range, p90=0.6 * better.range)
+    worse = better._replace(range=0.5 * better.range, p10=0.4 * better.range, p90=0.6 * better.range)
     f.learner.distance += 10.0
     shown = f.shown(worse)
     assert shown.range > worse.p90

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import pytest
 
@@ -25,7 +24,7 @@ def rides(f: Forecaster, price: float, km: int = 40) -> None:
     for _ in range(int(km * 1000 / CONSUMPTION.segment_m)):
         habits = habits._replace(price=habits.price.learned(price - habits.price.now, CONSUMPTION.segment_m))
     sums = Segment(distance=CONSUMPTION.segment_m, duration=20.0)
-    learner.state = replace(learner.state, habits=habits, sums=sums)
+    learner.state = learner.state._replace(habits=habits, sums=sums)
 
 
 def test_each_rider_has_a_price_and_it_is_kept():

@@ -157,7 +157,7 @@ def test_hills_ahead_are_called_that(grade):
 
 
 def test_no_pack_is_better_than_new_on_a_route_either():
-    found, answer = Rider(way(60e3)).settled(replace(FREE, energy_sd=6e5))
+    found, answer = Rider(way(60e3)).settled(FREE._replace(energy_sd=6e5))
     alike, same = Rider(way(60e3)).settled()
     assert found.p10 < 0.95 * alike.p10
     assert found.p90 == pytest.approx(alike.p90)
@@ -254,7 +254,7 @@ def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
     for k in range(600):  # its end is reached after 5 km
         rider.ride(1, 1000.0)
         rider.forecaster.learner.distance += 11.0
-        free = replace(FREE, range=2 * FREE.range)
+        free = FREE._replace(range=2 * FREE.range)
         found = rider.ask(free if k > 300 else FREE)
         answers.append((rider.forecast.outlook.route_state, found.range, rider.forecaster.shown(found).range))
     left = next(k for k, (state, *_) in enumerate(answers) if k > 300 and state == RouteState.OFF)
@@ -321,7 +321,7 @@ def test_its_end_is_the_end_of_it():
 
 
 def test_an_empty_battery_has_no_range():
-    found, answer = Rider(way(5e3)).settled(replace(FREE, left=Drawable(0.0, 6e6, 0.02), energy_sd=3e4), soc=0.02)
+    found, answer = Rider(way(5e3)).settled(FREE._replace(left=Drawable(0.0, 6e6, 0.02), energy_sd=3e4), soc=0.02)
     assert found.range == found.p10 == 0.0 < found.p90 < 2e3
     assert (answer.arrival_soc, answer.battery_ends_after) == (0.0, 0.0)
 
@@ -365,7 +365,7 @@ def test_soc_left_is_where_that_share_is_left(soc, share, temperature, power, fo
 
 def test_the_charge_at_arrival_is_that_which_will_be_shown_there():
     """Of a pack that gives up at 20 % of charge, as in the cold, more than that is shown while energy is left."""
-    cold = replace(FREE, left=Drawable(4e6, 8.5e6, 0.2))
+    cold = FREE._replace(left=Drawable(4e6, 8.5e6, 0.2))
     answer = Rider(way(48e3)).settled(cold)[1]
     assert 0 < answer.route_energy < 4e6
     assert answer.arrival_soc == pytest.approx(0.7 - 0.5 * answer.route_energy / 4e6, abs=0.02)
