@@ -25,6 +25,7 @@ from gz_onboard.state import sync_directory
 
 _NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d{1,9}))?\.mcap")
 _STUCK_S = 10.0  # no disk takes as long
+PORTION_NS = 450_000_000  # between two portions that the thread gets: every fifth tick, also if one comes early
 _LEFT_FREE = 64 << 20  # bytes
 _LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with the DBC files
 
@@ -83,6 +84,7 @@ class Recorder:
         self._limits = limits
         self._retry_ns = round(limits.retry_s * 1e9)
         self._file_bytes = limits.max_file_bytes
+        self._stream: IO[bytes] | None = None  # of the file in use, or of one that is being started
         self._file: LogFile | None = None
         self._synced_ns: int | None = None
         self._failed_ns: int | None = None
@@ -105,11 +107,7 @@ class Recorder:
 
     def frames(self, batch: Sequence[Frame]) -> None:
         """Log raw frames, in the order received."""
-        if not batch:
-            return
-        if file := self._open_file(batch[0][0]):
-            self._try(batch[-1][0], file.frames, batch)
-        else:
+        if batch and not self._write(batch[0][0], lambda file: file.frames(batch)):
             self.lost_frames += len(batch)
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
@@ -118,8 +116,7 @@ class Recorder:
         seen_ns: when the values were true, if not at `time_ns`.
         """
         self._channels[topic]
-        if file := self._open_file(time_ns):
-            self._try(time_ns, file.sample, topic, time_ns, values, seen_ns)
+        self._write(time_ns, lambda file: file.sample(topic, time_ns, values, seen_ns))
 
     def sync(self, now_ns: int) -> None:
         """Bring everything onto the disk, once in `sync_s`; call it in each round of the main loop."""
@@ -129,25 +126,35 @@ class Recorder:
             self._synced_ns = now_ns
         if abs(now_ns - self._synced_ns) >= self._limits.sync_s * 1e9:
             self._synced_ns = now_ns
-            self._try(now_ns, self._sync, self._file, now_ns)
+            self._write(now_ns, lambda file: self._sync(file, now_ns))
 
     def close(self) -> None:
         """Close the file; frames and samples logged later start a new one."""
         if self._file is not None:
-            self._try(self._file.start_ns, self._close_file, self._file)
+            self._write(self._file.start_ns, self._close_file)
 
-    def _try(self, now_ns: int, write: Callable[..., None], *arguments: Any) -> None:
-        """Call `write`; whatever it raises costs this file and nothing more."""
+    def _write(self, now_ns: int, write: Callable[[LogFile], None]) -> bool:
+        """Call `write` with the file in use, or a new one; False while an error is waited out, and if no file starts.
+
+        Whatever is raised costs this file and nothing more.
+        """
+        if self._file is None and self._failed_ns is not None and abs(now_ns - self._failed_ns) < self._retry_ns:
+            return False
         try:
-            write(*arguments)
-        except Exception as error:
-            file, self._file = self._file, None
+            write(self._file or self._start_file(now_ns))
+        except Exception as error:  # of the disk, or the time is no date
             self._note(error, now_ns)
-            if file is not None:
-                self.lost_frames += file.unsynced_frames
-                file.abandon()
-                if not file.flushed:
-                    self._discard()
+            file, self._file, stream, self._stream = self._file, None, self._stream, None
+            if stream:
+                with contextlib.suppress(OSError):
+                    stream.close()
+                if not (file and file.flushed):  # it never came to hold anything: each attempt would leave one
+                    with contextlib.suppress(OSError):
+                        self.paths.pop().unlink()
+            if file is None:
+                return False
+            self.lost_frames += file.unsynced_frames
+        return True
 
     def _sync(self, file: LogFile, now_ns: int) -> None:
         file.flush(to_disk=True)
@@ -164,43 +171,25 @@ class Recorder:
 
     def _close_file(self, file: LogFile) -> None:
         file.close()
-        self._file = None
+        self._file = self._stream = None
 
-    def _open_file(self, start_ns: int) -> LogFile | None:
-        """The file in use, or a new one, or None while an error is waited out."""
-        if self._file is not None:
-            return self._file
-        if self._failed_ns is not None and abs(start_ns - self._failed_ns) < self._retry_ns:
-            return None
+    def _start_file(self, start_ns: int) -> LogFile:
         self._synced_ns = None
-        stream = None
-        try:
-            self._directory.mkdir(parents=True, exist_ok=True)
-            self._make_room()
-            stream = self._create(start_ns)
-            file = LogFile(stream, start_ns, self._metadata, self._attachments)
-            for topic, (schema, metadata) in self._channels.items():
-                file.channel(topic, schema, metadata)
-        except Exception as error:  # of the disk, or the time is no date
-            self._note(error, start_ns)
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
-                self._discard()
-            return None
-        self._failed_ns = None
-        self._file = file
-        return file
-
-    def _create(self, start_ns: int) -> IO[bytes]:
+        self._directory.mkdir(parents=True, exist_ok=True)
+        self._make_room()
         start = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
         number = max((number for number, _, _ in self._own()), default=0) + 1
         path = self._directory / f"{start}_{self._vehicle}{'' if number == 1 else f'~{number}'}.mcap"
-        stream = path.open("xb")
-        lock(stream)
+        self._stream = path.open("xb")
         self.paths.append(path)
+        lock(self._stream)
         sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
-        return stream
+        file = LogFile(self._stream, start_ns, self._metadata, self._attachments)
+        for topic, (schema, metadata) in self._channels.items():
+            file.channel(topic, schema, metadata)
+        self._failed_ns = None
+        self._file = file
+        return file
 
     def _own(self) -> list[tuple[int, str, Path]]:
         """Running number, start and path of the files named as ours, the oldest first."""
@@ -237,11 +226,6 @@ class Recorder:
         self.errors += 1
         self.last_error = str(error) or repr(error)
         self._failed_ns = now_ns
-
-    def _discard(self) -> None:
-        """Remove a file that never came to hold anything: on a full disk each attempt would leave one."""
-        with contextlib.suppress(OSError):
-            self.paths.pop().unlink()
 
 
 def is_complete(path: Path) -> bool:
@@ -285,30 +269,28 @@ def _delete(path: Path) -> None:
 class BackgroundRecorder:
     """Runs a `Recorder` on its own thread, so that the caller never waits for the disk.
 
-    Entries are handed over at `sync`, all at once: the thread wakes once a tick, not for each sample. limit: how many
-    frames may wait for the disk (each value of a sample counts as one frame). Beyond it a whole portion is dropped, and
-    its frames are counted in `lost_frames`. Nobody else may use the recorder.
+    What is logged is handed over at `sync`, twice a second and all at once: waking the thread costs as much as a
+    hundred frames. limit: how many frames may wait for the disk (each value of a sample counts as one). Beyond it a
+    whole portion is dropped, and its frames are counted in `lost_frames`. Nobody else may use the recorder.
     """
 
     def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
         self._recorder = recorder
         self._thread = Background("log", limit)
         self._dropped_frames = 0
-        self._full = False
-        self._portion: list[tuple[Callable[..., None], tuple[Any, ...]]] = []  # since the last `sync`
-        self._frames = self._values = 0  # in it
+        self._is_full = False
+        self._frames: list[Frame] = []  # since they were last handed over
+        self._samples: list[tuple[str, int, Mapping[str, object], int | None]] = []
+        self._handed_ns = 0
 
     @property
-    def failing(self) -> bool:
-        """Whether frames are lost: errors, or a disk that is too slow or does not answer."""
-        return self._recorder.failing or self._full or self._thread.stuck > _STUCK_S
-
-    @property
-    def last_error(self) -> str:
-        """Why it is failing."""
+    def error(self) -> str:
+        """Why frames are lost: errors, or a disk that is too slow or does not answer; empty if none are."""
         if self._recorder.failing:
             return self._recorder.last_error
-        return "the disk is too slow" if self._full else "the disk does not answer"
+        if self._is_full:
+            return "the disk is too slow"
+        return "the disk does not answer" if self._thread.stuck > _STUCK_S else ""
 
     @property
     def lost_frames(self) -> int:
@@ -320,38 +302,39 @@ class BackgroundRecorder:
         self._recorder.channel(topic, json_schema, metadata)
 
     def frames(self, batch: Sequence[Frame]) -> None:
-        """As `Recorder.frames`, at the next `sync`; `batch` may not be changed afterwards."""
-        if batch:
-            self._portion.append((self._recorder.frames, (batch,)))
-            self._frames += len(batch)
+        """As `Recorder.frames`, later."""
+        self._frames += batch
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
-        """As `Recorder.sample`, at the next `sync`; `values` may not be changed afterwards."""
-        self._portion.append((self._recorder.sample, (topic, time_ns, values, seen_ns)))
-        self._values += len(values)
+        """As `Recorder.sample`, later; `values` may not be changed afterwards."""
+        self._samples.append((topic, time_ns, values, seen_ns))
 
     def sync(self, now_ns: int) -> None:
-        """Hand over what was logged since the last time, then sync as `Recorder.sync`."""
-        if self._full and self._thread.load < 0.5:
-            self._full = False
-        self._portion.append((self._recorder.sync, (now_ns,)))
-        self._hand_over()
+        """Hand over what was logged, if it is time, and sync as `Recorder.sync`; call it once a tick."""
+        if abs(now_ns - self._handed_ns) >= PORTION_NS:
+            self._handed_ns = now_ns
+            self._is_full &= self._thread.load >= 0.5
+            self._hand_over(now_ns)
 
     def close(self, seconds: float) -> bool:
         """Write what waits and close the file; False if that takes longer than `seconds`: the rest is lost then."""
-        self._hand_over()
+        self._hand_over(self._handed_ns)
         self._thread.call(self._recorder.close, weight=0)
         return self._thread.close(seconds)
 
-    def _hand_over(self) -> None:
-        portion, frames, weight = self._portion, self._frames, self._frames + self._values
-        self._portion, self._frames, self._values = [], 0, 0
+    def _hand_over(self, now_ns: int) -> None:
+        frames, samples = self._frames, self._samples
+        self._frames, self._samples = [], []
+        weight = len(frames) + sum(len(values) for _, _, values, _ in samples)
         # A mere sync has a weight, too: else they would pile up behind a disk that does not answer.
-        if not self._thread.call(_call_all, portion, weight=max(weight, 1)) and weight:
-            self._dropped_frames += frames
-            self._full = True
+        if not self._thread.call(self._write, frames, samples, now_ns, weight=max(weight, 1)) and weight:
+            self._dropped_frames += len(frames)
+            self._is_full = True
 
-
-def _call_all(portion: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> None:
-    for function, arguments in portion:
-        function(*arguments)
+    def _write(
+        self, frames: list[Frame], samples: list[tuple[str, int, Mapping[str, object], int | None]], now_ns: int
+    ) -> None:
+        self._recorder.frames(frames)
+        for sample in samples:
+            self._recorder.sample(*sample)
+        self._recorder.sync(now_ns)

@@ -174,7 +174,7 @@ class Daemon:
             pipeline.log_lost = self._log.lost_frames
         problems = {
             Reason.BUS_DOWN: not all(channel.up for channel in self.channels),
-            Reason.LOG_FAILED: self._log and self._log.failing,
+            Reason.LOG_FAILED: self._log and self._log.error,
             Reason.SAVE_FAILED: self._keeper and self._keeper.error,
         }
         pipeline.extra_reasons = Reason(sum(reason for reason, found in problems.items() if found))
@@ -190,8 +190,8 @@ class Daemon:
         """Give systemd the status, and log changes of it."""
         pipeline, last = self.pipeline, self.pipeline.last
         said = {}
-        if self._log and self._log.failing:
-            said["log"] = f"cannot write the log: {self._log.last_error}"
+        if self._log and (error := self._log.error):
+            said["log"] = f"cannot write the log: {error}"
         if self._keeper and (error := self._keeper.error):
             said["state"] = f"cannot save the state: {error}"
         if pipeline.foreign:
