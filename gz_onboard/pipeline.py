@@ -279,16 +279,17 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
             f"from which on {MESSAGES} are free in them"
         )
     if vehicle.battery:
-        full = drawable(vehicle.battery, 1.0, BENCH_TEMPERATURE, 1.0).energy / WH
+        full = drawable(vehicle.battery, 1.0, BENCH_TEMPERATURE, 1.0).energy
         forecaster = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
         reach = forecaster.forecast(1.0, 0.0, BENCH_TEMPERATURE, 0.0, BENCH_TEMPERATURE, 0.0).range
-        for what, value, signal, unit in (
-            ("the battery holds", full, "RANGE_EnergyLeft", "Wh"),
-            ("the expected range from full is", reach * 1e-3, "RANGE_Remaining", "km"),
+        for what, value, signal, si, unit in (
+            ("the battery holds", full, "RANGE_EnergyLeft", WH, "Wh"),
+            ("the expected range from full is", reach, "RANGE_Remaining", 1000.0, "km"),
         ):
             if value > (most := publisher.greatest(signal)):
                 raise vehicle.error(
-                    f"{what} {value:.0f} {unit}, but {signal} of {publisher.file} says at most {most:g} {unit}: "
+                    f"{what} {value / si:.0f} {unit}, but {signal} of {publisher.file} says at most "
+                    f"{most / si:g} {unit}: "
                     'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
                 )
     return publisher

@@ -12,14 +12,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import database_of, find_dbc, read_dbc
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, MOST_STANDARD, TRANSMITTED, Cause, Estimate, Explanation, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, MOST_STANDARD, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 RANGE_DBC = "range.dbc"
 MESSAGES = 8  # in it
 LENGTH = 8  # bytes of each
+_SI = {"km": 1000.0, "Wh": WH, "Wh/km": WH_PER_KM, "%": 0.01, "min": MINUTE}  # in one unit of its signals
 GROUP_STEP = 0x100  # from one parameter group of J1939 to the next
 _NUMBERED = re.compile(rb"\b(BO_|SG_|VAL_|BO_TX_BU_|SIG_GROUP_|SIG_VALTYPE_) (\d+)\b")  # statements on a message
 
@@ -76,7 +77,7 @@ class Publisher:
         return _NUMBERED.sub(lambda found: found[1] + b" " + new.get(found[2], found[2]), self.file.read_bytes())
 
     def greatest(self, signal: str) -> float:
-        """The largest value of `signal`, in the unit of the DBC."""
+        """The largest value of `signal`, in SI units."""
         field = self._fields[signal]
         return max(limit * field.scale + field.offset for limit in (field.low, field.high))
 
@@ -84,27 +85,33 @@ class Publisher:
         """The frames of every second."""
         e = estimate
         state, remaining, p10, p90 = self.reported(e)
-        known = state in KNOWN
         values: dict[str, float | None] = {
             "RANGE_Remaining": remaining,
             "RANGE_RemainingP10": p10,
             "RANGE_RemainingP90": p90,
             "RANGE_EstimateState": state,
-            "RANGE_EnergyLeft": _scaled(e.energy_left, 1 / WH) if known else None,
-            "RANGE_ConsumptionRecent": _scaled(e.consumption_recent, 1 / WH_PER_KM),
-            "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
-            "RANGE_TimeToFull": _scaled(e.time_to_full, 1 / MINUTE) if known else None,
-            "RANGE_RemainingFull": _scaled(e.range_full, 1e-3) if known else None,
-            "RANGE_ChargePower": e.charge_power if known else None,
-            "RANGE_ArrivalStateOfCharge": _scaled(e.arrival_soc, 100) if known else None,
-            "RANGE_ArrivalStateOfChargeP10": _scaled(e.arrival_soc_p10, 100) if known else None,
-            "RANGE_RouteLeft": _scaled(e.route_left, 1e-3) if known else None,
-            "RANGE_BatteryEndsAfter": _scaled(e.battery_ends_after, 1e-3) if known else None,
+            "RANGE_ConsumptionRecent": e.consumption_recent,
             "RANGE_RouteState": e.route_state,
-            **_why(e.why if known else None),
         }
-        counted = ((f"RANGE_Count{name.capitalize()}", count) for name, count in vars(counts).items())
-        values |= {signal: min(count, self.greatest(signal)) for signal, count in counted}
+        if state in KNOWN:
+            values |= {
+                "RANGE_EnergyLeft": e.energy_left,
+                "RANGE_ConsumptionExpected": e.consumption_expected,
+                "RANGE_TimeToFull": e.time_to_full,
+                "RANGE_RemainingFull": e.range_full,
+                "RANGE_ChargePower": e.charge_power,
+                "RANGE_ArrivalStateOfCharge": e.arrival_soc,
+                "RANGE_ArrivalStateOfChargeP10": e.arrival_soc_p10,
+                "RANGE_RouteLeft": e.route_left,
+                "RANGE_BatteryEndsAfter": e.battery_ends_after,
+            }
+            if e.why:
+                values["RANGE_WhyRated"] = e.why.reference
+                for i, (cause, size) in enumerate(e.why.largest()[:2], 1):
+                    values |= {f"RANGE_WhyCause{i}": cause, f"RANGE_WhyDistance{i}": size}
+        for name, count in vars(counts).items():
+            signal = f"RANGE_Count{name.capitalize()}"
+            values[signal] = min(count, self.greatest(signal))
         values |= {signal: 1 for role in e.distrusted if (signal := sensor_signal(role)) in self._fields}
         return self._frames(self._pack(values, [name for name in self.messages if name != STATUS]), time_ns)
 
@@ -112,45 +119,38 @@ class Publisher:
         """The frame of every tenth of a second. `estimate` may not be changed afterwards: it is packed once."""
         if estimate is not self._status[0]:
             state = self.reported(estimate)[0]
-            soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
-            if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
-                soc = sigma = None  # neither is of use without the other
-            values = {SOC: soc, SIGMA: sigma, "RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
+            values: dict[str, float | None] = {"RANGE_StatusState": state, "RANGE_Activity": estimate.activity}
             values |= {reason_signal(reason): 1 for reason in estimate.reasons}
+            charge = {SOC: estimate.soc, SIGMA: estimate.soc_sd}
+            if state in KNOWN and all(self._fields[signal].raw(value) is not None for signal, value in charge.items()):
+                values |= charge  # neither is of use without the other
             self._status = estimate, self._pack(values, [STATUS])
         return self._frames(self._status[1], time_ns)
 
     def _pack(self, values: Mapping[str, float | None], messages: Iterable[str]) -> dict[str, int]:
-        """The bits of `messages` without counter and checksum; signals that `values` leaves out are 0."""
+        """The bits of `messages` without counter and checksum; what `values` leaves out is 0, or not available."""
         words = {name: self._encoders[name].blank for name in messages}
         for signal, value in values.items():
             field = self._fields[signal]
-            words[field.message] |= field.bits(value)
+            if (raw := field.raw(value)) is not None:
+                words[field.message] ^= (raw & field.mask ^ field.blank) << field.shift
         return words
 
     def _frames(self, words: Mapping[str, int], time_ns: int) -> list[Frame]:
         return [self._encoders[name].frame(word, time_ns) for name, word in words.items()]
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
-        """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
+        """(state, range, P10, P90) [m] as they are sent: never valid unless all three are there and in their order."""
         if e.state not in KNOWN:
             return e.state, None, None, None
-        remaining, p10, p90 = _scaled(e.range, 1e-3), _scaled(e.range_p10, 1e-3), _scaled(e.range_p90, 1e-3)
-        if (
-            remaining is None
-            or p10 is None
-            or p90 is None
-            or not 0 <= p10 <= remaining <= p90  # so for NaN
-            or not self._can_say("RANGE_Remaining", remaining)
-            or not self._can_say("RANGE_RemainingP10", p10)
-        ):
+        median, p10, p90 = e.range, e.range_p10, e.range_p90
+        is_ordered = median is not None and p10 is not None and p90 is not None and 0 <= p10 <= median <= p90
+        fields = self._fields
+        if not is_ordered or None in (fields["RANGE_Remaining"].raw(median), fields["RANGE_RemainingP10"].raw(p10)):
             return State.INVALID, None, None, None
-        if not self._can_say("RANGE_RemainingP90", p90):
-            return State.DEGRADED, remaining, p10, None
-        return e.state, remaining, p10, p90
-
-    def _can_say(self, signal: str, value: float | None) -> bool:
-        return self._fields[signal].raw(value) is not None
+        if fields["RANGE_RemainingP90"].raw(p90) is None:
+            return State.DEGRADED, median, p10, None
+        return e.state, median, p10, p90
 
 
 STATUS, SOC, SIGMA = "RANGE_Status", "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
@@ -166,19 +166,6 @@ def sensor_signal(role: str) -> str:
 def reason_signal(reason: Reason) -> str:
     """The signal that carries `reason`: NO_IMU is RANGE_NoImu."""
     return "RANGE_" + "".join(word.capitalize() for word in str(reason.name).split("_"))
-
-
-def _why(why: Explanation | None) -> dict[str, float | None]:
-    """The rated range and the two largest causes; unknown ones are None."""
-    nothing: tuple[Cause, float | None] = Cause.NONE, None
-    values: dict[str, float | None] = {"RANGE_WhyRated": why.reference * 1e-3 if why else None}
-    for i, (cause, size) in enumerate([*(why.largest() if why else ()), nothing, nothing][:2], 1):
-        values |= {f"RANGE_WhyCause{i}": cause, f"RANGE_WhyDistance{i}": _scaled(size, 1e-3)}
-    return values
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
 
 
 # --- what a DBC file must hold, and the places of its signals ---------------------------------------------------------
@@ -229,13 +216,14 @@ def _signal_problem(signal: Signal, model: Signal) -> str:
     if first_bit(signal) + signal.length > 56:
         return "stands in the last byte, which is the checksum's"
     unit = model.unit or ""
+    if (signal.unit or "") != unit:
+        return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
     if model.length >= 8:  # a quantity, with a code for not available
-        if (signal.unit or "") != unit:
-            return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
         if signal.length < 8:
             return f"needs 8 bits or more for the code 'not available', has {signal.length}"
-        missing = [value for value in (0, 100 if model.name == SOC else 0) if _Field(signal, "").raw(value) is None]
-        return f"must be able to say {missing[0]} {unit}".rstrip() if missing else ""
+        needed = (0, 1) if model.name == SOC else (0,)
+        missing = [value for value in needed if _Field(signal, "").raw(value) is None]
+        return f"must be able to say {100 * missing[0]} {unit}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
     is_whole = (signal.conversion.scale, signal.conversion.offset, low) == (1, 0, 0) and high >= most
@@ -247,24 +235,21 @@ class _Field:
 
     def __init__(self, signal: Signal, message: str) -> None:
         first = first_bit(signal)
+        unit = _SI.get(signal.unit or "", 1.0)
         self.message = message
         self.low, self.high = raw_range(signal, not_available=True)
-        self.scale, self.offset = float(signal.conversion.scale), float(signal.conversion.offset)
+        self.scale, self.offset = float(signal.conversion.scale) * unit, float(signal.conversion.offset) * unit
         self.mask = (1 << int(signal.length)) - 1
-        self.absent = self.mask // 2 + 1 if signal.is_signed else self.mask
+        is_whole = signal.name.startswith("RANGE_") and not signal.unit
+        self.blank = 0 if is_whole else self.mask // 2 + 1 if signal.is_signed else self.mask  # or not available
         self.shift = first if signal.byte_order == "little_endian" else 56 - first - signal.length
 
     def raw(self, value: float | None) -> int | None:
-        """The nearest raw value; None if `value` is unknown, not finite, or outside the range of the signal."""
-        if value is None or not abs(value) < 1e12:  # infinity and NaN too
+        """The nearest raw value of one in SI units; None if that is unknown, not finite or cannot be said."""
+        if value is None or not abs(value) < 1e15:  # infinity and NaN too
             return None
         raw = round((value - self.offset) / self.scale)
         return raw if self.low <= raw <= self.high else None
-
-    def bits(self, value: float | None) -> int:
-        """The nearest raw value, or the code for not available, shifted to its place."""
-        raw = self.raw(value)
-        return (self.absent if raw is None else raw & self.mask) << self.shift
 
 
 class _Encoder:
@@ -272,18 +257,16 @@ class _Encoder:
 
     def __init__(self, message: Message, identifier: int) -> None:
         fields = {s.name: _Field(s, message.name) for s in message.signals if not s.name.endswith("CRC")}
-        self.blank = 2**56 - 1  # ones in unused bits; signals that are not ours are not available
-        for name, field in fields.items():
-            self.blank &= ~(field.mask << field.shift)
-            self.blank |= 0 if name.startswith("RANGE_") else field.absent << field.shift
+        self.blank = 2**56 - 1  # ones in unused bits
+        for field in fields.values():
+            self.blank ^= (field.mask ^ field.blank) << field.shift
         self._identifier, self._counter_field = identifier, fields.pop(f"{message.name}Counter")
-        self._is_little = message.signals[0].byte_order == "little_endian"
+        self._order: Literal["little", "big"] = "little" if message.signals[0].byte_order == "little_endian" else "big"
         self._counter = 0  # of the next frame
         self.fields = fields
 
     def frame(self, word: int, time_ns: int) -> Frame:
         """The next frame, whose signals have the bits of `word`."""
-        word |= self._counter << self._counter_field.shift
+        data = (word | self._counter << self._counter_field.shift).to_bytes(7, self._order)
         self._counter = (self._counter + 1) % (int(self._counter_field.high) + 1)
-        data = word.to_bytes(7, "little" if self._is_little else "big")
         return time_ns, self._identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED

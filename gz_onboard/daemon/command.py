@@ -187,7 +187,7 @@ def summary(pipeline: Pipeline) -> list[str]:
     earlier = ""
     if known and known.soc is not None and known.soc_sd is not None:
         _, *numbers = pipeline.publisher.reported(known)
-        remaining, p10, p90 = ("–" if value is None else f"{value:.1f}" for value in numbers)
+        remaining, p10, p90 = ("–" if value is None else f"{value / 1000:.1f}" for value in numbers)
         soc = f"state of charge {100 * known.soc:.1f} % ± {100 * known.soc_sd:.1f} %"
         lines += [f"{soc}, ridden {last.distance / 1000:.2f} km", f"range {remaining} km ({p10} to {p90})"]
         earlier = f"; the figures above are from {last.time - known.time:.1f} s earlier" if known is not last else ""

@@ -200,7 +200,7 @@ class Daemon:
             shown, remaining, _, _ = pipeline.publisher.reported(last)
             said["estimate"] = text = state_text(shown, last.reasons)
             if remaining is not None and last.soc is not None:
-                text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
+                text = f"{remaining / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
             notify(STATUS=text)
         counts = pipeline.counts()
         for subject, text in said.items():
