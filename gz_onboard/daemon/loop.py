@@ -71,7 +71,8 @@ class Daemon:
         self._offset = _wall_offset()
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         self._reported_at = 0.0
-        self._reported: dict[str, str] = {}  # by subject: its text a second ago
+        self._problems: list[str] = []  # a second ago, as the next two
+        self._state = self._status = ""
 
     def stop(self, *_: object) -> None:
         """End after the present tick."""
@@ -187,28 +188,29 @@ class Daemon:
             self._keeper.save_if_due(pipeline, now_ns)
 
     def _report(self) -> None:
-        """Give systemd the status, and log changes of it."""
+        """Log new problems and a new state, and give systemd a new status."""
         pipeline, last = self.pipeline, self.pipeline.last
-        said = {}
-        if self._log and (error := self._log.error):
-            said["log"] = f"cannot write the log: {error}"
-        if self._keeper and (error := self._keeper.error):
-            said["state"] = f"cannot save the state: {error}"
-        if pipeline.foreign:
-            said["foreign"] = foreign_text(pipeline)
-        if last is not None:
-            shown, remaining, _, _ = pipeline.publisher.reported(last)
-            said["estimate"] = text = state_text(shown, last.reasons)
-            if remaining is not None and last.soc is not None:
-                text = f"{remaining / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
-            notify(STATUS=text)
-        counts = pipeline.counts()
-        for subject, text in said.items():
-            if text != self._reported.get(subject) and subject == "estimate":
-                log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
-            elif text != self._reported.get(subject):
+        problems = [foreign_text(pipeline)] if pipeline.foreign else []
+        if self._log and self._log.error:
+            problems.append(f"cannot write the log: {self._log.error}")
+        if self._keeper and self._keeper.error:
+            problems.append(f"cannot save the state: {self._keeper.error}")
+        for text in problems:
+            if text not in self._problems:
                 log.warning("%s", text)
-        self._reported = said
+        self._problems = problems
+        if last is None:
+            return
+        state, remaining, _, _ = pipeline.publisher.reported(last)
+        status = text = state_text(state, last.reasons)
+        if remaining is not None and last.soc is not None:
+            status = f"{remaining / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
+        if text != self._state:
+            counts = pipeline.counts()
+            log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
+        if status != self._status:
+            notify(STATUS=status)
+        self._state, self._status = text, status
 
 
 class StateKeeper:
