@@ -23,7 +23,7 @@ from urllib.request import urlopen
 
 from gz_onboard import cli
 from gz_onboard.bus._can import can
-from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.events import Activity, Estimate, Frame, State
 

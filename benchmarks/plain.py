@@ -27,7 +27,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from mcap.writer import Writer
 
 from gz_onboard.bus._can import can
-from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.vehicle import read_vehicle
 
 DBC = Path(__file__).resolve().parents[1] / "dbc"

@@ -11,8 +11,8 @@ from typing import Any
 
 from cantools.database.can import Database, Message
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.offline.write_logs import write_frames_as

@@ -15,13 +15,12 @@ from math import isnan
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, by_response
-from gz_onboard.bus.checksum import crc_differences
 from gz_onboard.bus.layout import (
     Column,
     Layout,
     MessageSignals,
     Values,
+    crc_differences,
     identifier_of,
     is_not_available,
     plausible_range,
@@ -29,7 +28,7 @@ from gz_onboard.bus.layout import (
 )
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.origins import Origin, Origins
-from gz_onboard.bus.requests import FUNCTIONAL
+from gz_onboard.bus.requests import FUNCTIONAL, INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, by_response
 from gz_onboard.events import (
     ERR_FLAG,
     RTR_FLAG,

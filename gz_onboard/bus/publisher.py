@@ -14,9 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import database_of, find_dbc, read_dbc
-from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
+from gz_onboard.bus.layout import crc8_sae_j1850, first_bit, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, MOST_STANDARD, TRANSMITTED, Estimate, Frame, Reason, State

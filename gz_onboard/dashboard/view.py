@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.layout import raw_range
+from gz_onboard.bus.layout import crc8_sae_j1850, raw_range
 from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal, sensor_signal
 from gz_onboard.dashboard.vehicle_frames import LATE_PERIODS, VehicleFrames
 from gz_onboard.events import (

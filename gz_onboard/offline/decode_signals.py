@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.answers import NEGATIVE, AnswerReader, by_response
 from gz_onboard.bus.layout import MessageSignals, Values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
+from gz_onboard.bus.requests import NEGATIVE, AnswerReader, by_response
 from gz_onboard.events import Frame
 
 if TYPE_CHECKING:

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
-from gz_onboard.bus.layout import first_bit, is_not_available
+from gz_onboard.bus.layout import first_bit, is_not_available, sae_j1850_tables
 from gz_onboard.bus.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, TICKS_PER_WINDOW, WINDOW_NS, Pipeline

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Assembler
 from gz_onboard.bus.codec import LENGTH, RANGE, Codec
+from gz_onboard.bus.requests import INTERRUPTED, MALFORMED, SEQUENCE, Assembler
 from gz_onboard.events import Frame
 from gz_onboard.offline.decode_signals import Decoder
 from gz_onboard.pipeline import Pipeline

@@ -11,7 +11,6 @@ from cantools.database.can import Database
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import (
     CONFLICT,
     COUNTER,
@@ -25,6 +24,7 @@ from gz_onboard.bus.codec import (
     known_identifiers,
 )
 from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame

@@ -12,9 +12,9 @@ from cantools.database.can import Database
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.mapping import read_mapping
 from gz_onboard.bus.publisher import SIGMA, SOC, Counts, Publisher, reason_signal, sensor_signal
 from gz_onboard.errors import InputError

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 from gz_onboard.bus._can import can
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.command import pictures
 from gz_onboard.dashboard.server import Feed, served

@@ -304,7 +304,7 @@ def test_counters():
     st.booleans(),
 )
 def test_nothing_on_the_bus_breaks_it(frames, checksum):
-    from gz_onboard.bus.checksum import crc8_sae_j1850
+    from gz_onboard.bus.layout import crc8_sae_j1850
 
     view, now = View(), 0.0
     for identifier, data, pause in frames:

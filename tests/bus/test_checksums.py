@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.layout import crc8_sae_j1850
 
 
 def bit_by_bit(data: bytes) -> int:
