@@ -184,9 +184,15 @@ class TwoPairs(CellEffects):
         return True
 
     def step(
-        self, dt: float, current: float, soc: float, temperature: float, others: Mapping[str, float] | None = None
+        self,
+        battery: Battery,
+        dt: float,
+        current: float,
+        soc: float,
+        temperature: float,
+        others: Mapping[str, float] | None = None,
     ) -> None:
-        super().step(dt, current, soc, temperature, others)
+        super().step(battery, dt, current, soc, temperature, others)
         decay = exp(-dt / self.slow_time.at(soc, temperature)[0])
         self.v2 = decay * self.v2 + (1 - decay) * self.slow_resistance.at(soc, temperature)[0] * current
         self.overpotential += self.v2
@@ -241,7 +247,7 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = EventEstimator(groups, battery, model, vehicle.riding)
     if setting.slow:
-        estimator.pack.effects = effects = TwoPairs(model, estimator.battery)
+        estimator.pack.effects = effects = TwoPairs(model, battery)
         effects.slow_resistance, effects.slow_time = setting.slow
     estimator.forecaster._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.

@@ -131,7 +131,7 @@ def main() -> None:
         for name, columns in rides.items():
             made, estimator = estimates(columns)
             without, _ = estimates(columns, lambda t, v: None)
-            learned = " | ".join(f"{x.value:.3f} ± {x.sd:.3f}" for x in estimator.weakest.learned().values())
+            learned = " | ".join(f"{x.value:.3f} ± {x.sd:.3f}" for x in estimator.pack.weakest.learned().values())
             pairs = zip(errors(columns, without), errors(columns, made), strict=True)
             told = " | ".join(f"{100 * before:+.1f} % | {100 * now:+.1f} %" for before, now in pairs)
             print(f"| {name} | {100 * columns['true soc'][-1]:.1f} % | {told} | {learned} |", flush=True)

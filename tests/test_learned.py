@@ -33,7 +33,7 @@ def saved(tmp_path: Path) -> Path:
     covariance = (*known.covariance[:4], 1e-4, 0.0, 0.0, 0.01**2, 0.0, 0.05**2)
     known = known._replace(inverse_capacity=1 / CAPACITY, resistance=RESISTANCE, covariance=covariance)
     estimator.pack.age.restart(known)
-    estimator.pack.state = known
+    estimator.pack.state, estimator.pack.is_started = known, True
     snapshot = estimator.snapshot(vehicle.key)
     assert snapshot
     file = tmp_path / "reference.json"
@@ -69,7 +69,7 @@ def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     price = learner.habits.price._replace(level=1.2, level_variance=0.01**2)
     learner.state = learner.state._replace(habits=learner.habits._replace(price=price))
     estimator.forecaster.ridden_by("anna")
-    estimator.pack.state = with_soc(estimator.pack._believed, 0.6, 1e-4)
+    estimator.pack.state, estimator.pack.is_started = with_soc(estimator.pack.state, 0.6, 1e-4), True
     changed = estimator.snapshot(vehicle.key)
     assert changed
     state.write(saved, state.encode(changed, time.time()))
@@ -108,8 +108,8 @@ def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, cap
     estimator = Pipeline(vehicle).estimator
     snapshot, _ = state.load(saved, time.time()) or ({}, None)
     estimator.restore(snapshot, vehicle.key, 0.0)
-    estimator.pack.state = with_soc(estimator.pack._believed, 0.6, 1e-4)
-    estimator.weakest.known = replace(estimator.weakest.known, means=(0.04, 1 / 0.9 - 1, 0.0, 0.0))
+    estimator.pack.state, estimator.pack.is_started = with_soc(estimator.pack.state, 0.6, 1e-4), True
+    estimator.pack.weakest.known = replace(estimator.pack.weakest.known, means=(0.04, 1 / 0.9 - 1, 0.0, 0.0))
     changed = estimator.snapshot(vehicle.key)
     assert changed
     state.write(saved, state.encode(changed, time.time()))

@@ -115,7 +115,8 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
 
 def battery_learned(estimator: Estimator) -> dict[str, LearnedFactor]:
     """Return the learned battery, by name; the weakest group only if its voltage is on the bus."""
-    return estimator.pack.learned() | (estimator.weakest.learned() if estimator.weakest.mapped else {})
+    pack = estimator.pack
+    return pack.learned() | (pack.weakest.learned() if pack.weakest.mapped else {})
 
 
 def riders_learned(estimator: Estimator) -> dict[str, dict[str, LearnedFactor]]:

@@ -34,8 +34,9 @@ from gz_onboard.estimator.plausibility.residual import ResponseGain
 from gz_onboard.estimator.rest import RestDetector
 from gz_onboard.estimator.saved_state import Each, Number
 from gz_onboard.estimator.signals import TIMING, Signals
+from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import WINDOW
-from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery, Health
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.functions import relaxed
 from gz_onboard.physics.model import STOOD, Model, standing_load
@@ -170,13 +171,19 @@ class InnovationTest:
 
 
 class BatteryPack:
-    """State of charge, capacity and resistance of one pack."""
+    """State of charge, capacity and resistance of one pack.
+
+    state: of the battery filter; a belief from before while it is not started, until the first voltage. battery: the
+    pack as it is believed to have aged; a new one whenever that changes.
+    """
 
     def __init__(self, battery: Battery, model: Model, backend: Backend, signals: Signals, sag: ResponseGain) -> None:
         p = model.parameters
-        self._battery, self._backend, self._signals = battery, backend, signals
+        self._filed = self.battery = battery
+        self._backend, self._signals = backend, signals
         self._sag = sag
-        self.age = PackAge(battery, backend)
+        self.age, self.weakest = PackAge(battery, backend), WeakestGroup(battery, signals, p)
+        self._follow_age()
         self.effects = CellEffects(model, battery)
         self.voltage_noise = VoltageNoise(battery, p)
         self._charge_noise = ChargeNoise(battery, p)
@@ -185,7 +192,7 @@ class BatteryPack:
         empty, full = battery.ocv(0.0)[0], battery.ocv(1.0)[0]
         self._span = full - empty
         self._possible = empty - PACK.possible * self._span, full + PACK.possible * self._span  # V
-        self._believed = self.age.unknown  # also while it waits for a first voltage
+        self.state = self.age.unknown
         self.is_started = False
         self.past: Past | None = None  # the vehicle when the state was believed last, while waiting
         self.past_age: float | None = None  # s; None: unknown
@@ -200,26 +207,16 @@ class BatteryPack:
         self._waiting_since = inf  # s: and at first
         self._was_unsteady = False
         self._started = -inf  # s
-        self._started_from: tuple[FilterState, Past | None, float | None] = self._believed, None, None
+        self._started_from: tuple[FilterState, Past | None, float | None] = self.state, None, None
         self._joined = self._was_doubted = False
         self._restarted_at = -inf  # s
         self._gap: tuple[float, FilterState, Past] | None = None  # when the pack was measured last, and the state then
         self._voltage_time: float | None = None  # s, of the message whose voltage was used last
         self._voltage_used = -inf  # s: when
-        self.another_pack = False  # whether this step has shown the pack to be replaced
         self.test = InnovationTest()
         self._rest = RestDetector()
 
     # --- what others ask --------------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> FilterState | None:
-        """The filter's state; None before the first voltage."""
-        return self._believed if self.is_started else None
-
-    @state.setter
-    def state(self, state: FilterState) -> None:
-        self._believed, self.is_started = state, True
 
     @property
     def current(self) -> float | None:
@@ -229,12 +226,12 @@ class BatteryPack:
     @property
     def soc(self) -> tuple[float, float]:
         """(state of charge of the cells, its standard deviation), with the belief of the capacity."""
-        return self.age.published(self._believed)
+        return self.age.published(self.state)
 
     @property
     def rest_voltage(self) -> float:
         """Voltage of the pack without a load [V] at this state of charge."""
-        return self._battery.ocv(self._believed.soc)[0] * self._battery.cells_series
+        return self.battery.ocv(self.state.soc)[0] * self.battery.cells_series
 
     @property
     def joined(self) -> bool:
@@ -247,15 +244,15 @@ class BatteryPack:
 
     def energy_sd(self, energy: float, slope: float, soc_sd: float) -> tuple[float, float]:
         """See `PackAge.energy_sd`."""
-        return self.age.energy_sd(self._believed, energy, slope, soc_sd)
+        return self.age.energy_sd(self.state, energy, slope, soc_sd)
 
     def learned(self) -> dict[str, LearnedFactor]:
         """Capacity and resistance, by name."""
-        return self.age.learned(self._believed)
+        return self.age.learned(self.state)
 
     def unlearn(self) -> None:
         """Return to the proven resistance, as a sensor was found faulty."""
-        self._believed = self.age.unlearn(self._believed)
+        self.state = self.age.unlearn(self.state)
 
     def cell_error(self, now: float, shown: tuple[float, float], sensor: str) -> float | None:
         """Measured minus predicted voltage of a cell [V] for those of the pack; None before the first voltage.
@@ -264,20 +261,20 @@ class BatteryPack:
         """
         if not self.is_started:
             return None
-        current = shown[1] / self._battery.cells_parallel
-        volts = self._battery.cell_voltage(*shown)
+        current = shown[1] / self.battery.cells_parallel
+        volts = self.battery.cell_voltage(*shown)
         if self.effects:
             volts += self.effects.supposed(sensor, now, current)
-        return volts - (self._cell.ocv - self._cell.r0 * current - self._believed.v1)
+        return volts - (self._cell.ocv - self._cell.r0 * current - self.state.v1)
 
     def heat(self, temperature: float) -> float:
         """Heat of the pack [W] at the last step's current and `temperature` [degC]; 0 before the first voltage."""
         if not self.is_started or not self.current:
             return 0.0
-        overpotential = self._believed.v1 + self.effects.overpotential
-        lost = self._cell.r0 * self.current / self._battery.cells_parallel + overpotential
-        watts = self._battery.cells_series * lost * self.current + self._battery.series_resistance * self.current**2
-        return watts + float(self._battery.reversible_heat(self.current, self._believed.soc, temperature))
+        overpotential = self.state.v1 + self.effects.overpotential
+        lost = self._cell.r0 * self.current / self.battery.cells_parallel + overpotential
+        watts = self.battery.cells_series * lost * self.current + self.battery.series_resistance * self.current**2
+        return watts + float(self.battery.reversible_heat(self.current, self.state.soc, temperature))
 
     # --- step by step -----------------------------------------------------------------------------------------
 
@@ -285,24 +282,36 @@ class BatteryPack:
         self, now: float, dt: float, reading: PackReading, temperature: float, speed: float | None, riding: RidingModel
     ) -> None:
         """Advance by `dt` [s] to `now` [s]; temperature: of the cells [degC]; speed in m/s."""
-        self.another_pack = False
         voltage, current = reading.voltage, reading.current
         if voltage is not None and not self._is_possible(voltage, current or 0.0):
-            voltage = None
+            voltage, reading = None, reading._replace(voltage=None)
             self.test.off += 1
-        if not self.is_started:
+        if self.is_started:
+            if dt > 0:
+                self._predict(now, dt, reading, temperature, riding)
+            self._follow_vehicle(now, dt, current, speed)
+            self._measure(now, dt, reading, temperature)
+            if self.weakest.mapped:
+                overpotential = self.effects.overpotential + self.state.v1
+                self.weakest.step(now, reading, temperature, self.battery, self.soc, overpotential)
+        else:
             if voltage is not None:
                 self._await_first(now, voltage, reading, temperature, speed, riding)
             self._now = self._now._replace(current=current)
-            return
-        if dt > 0:
-            self._predict(now, dt, reading, temperature, riding)
-        self._follow_vehicle(now, dt, current, speed)
+        self._follow_age()
+
+    def _follow_age(self) -> None:
+        """Make another `battery` if its age is believed to be another."""
+        health = Health(self.age.health.capacity, self.age.health.resistance, self.weakest.group)
+        if health != self.battery.health:
+            self.battery = self._filed.aged(health)
+
+    def _measure(self, now: float, dt: float, reading: PackReading, temperature: float) -> None:
+        """Condition the state on a voltage that came since the last step of `dt` [s], for all the time since."""
+        voltage, current, pack_voltage = reading.voltage, reading.current, self._signals.pack_voltage
         if voltage is None or current is None:
             self.test.innovation = None
             return
-        # A voltage that is held since the last message is used once, for all the time since.
-        pack_voltage = self._signals.pack_voltage
         is_pack = pack_voltage.fresh(now)
         received = pack_voltage.time if is_pack else self._signals.inverter_voltage.time
         if received == self._voltage_time:
@@ -319,8 +328,8 @@ class BatteryPack:
 
     def _is_possible(self, voltage: float, current: float) -> bool:
         """Whether cells can have a pack `voltage` [V]: an inverter that is not yet charged shows a few volts."""
-        drop = self._cell.r0 * current / self._battery.cells_parallel + self.effects.overpotential
-        return self._possible[0] < self._battery.cell_voltage(voltage, current) + drop < self._possible[1]
+        drop = self._cell.r0 * current / self.battery.cells_parallel + self.effects.overpotential
+        return self._possible[0] < self.battery.cell_voltage(voltage, current) + drop < self._possible[1]
 
     def _follow_vehicle(self, now: float, dt: float, current: float | None, speed: float | None) -> None:
         """Keep the odometer and the vehicle's own SOC; between two values they continue."""
@@ -334,7 +343,7 @@ class BatteryPack:
 
     def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
-        battery, state, signals = self._battery, self._believed, self._signals
+        battery, state, signals = self.battery, self.state, self._signals
         mean = reading.current or 0.0  # over the window
         if dt > signals.pause:  # of the current meanwhile only the ends are known
             mean = (mean + (mean if self.current is None else self.current)) / 2
@@ -358,14 +367,14 @@ class BatteryPack:
             self._now = self._now._replace(own_soc=self._now.own_soc - flowed)
         v1 = state.v1
         self._advance(dt, mean, variance, temperature)
-        self._v1_lag = (v1 - self._believed.v1) / 2 if dt <= 2 * WINDOW else 0.0
+        self._v1_lag = (v1 - self.state.v1) / 2 if dt <= 2 * WINDOW else 0.0
         if self.effects:
             inputs = riding.cell_inputs(now)
-            self.effects.step(dt, mean / battery.cells_parallel, self._believed.soc, temperature, inputs)
+            self.effects.step(battery, dt, mean / battery.cells_parallel, self.state.soc, temperature, inputs)
 
     def _advance(self, dt: float, current: float, variance: float, temperature: float) -> None:
         """Predict the state over `dt` [s] at a mean pack `current` [A]; variance: of SOC, by counting."""
-        battery, state, cell = self._battery, self._believed, self._cell
+        battery, state, cell = self.battery, self.state, self._cell
         decay = exp(-dt / cell.time)
         v1 = relaxed(state.v1, cell.r1 * current / battery.cells_parallel, decay)
         error, time = self._slow = self.voltage_noise.slow(state.soc, cell.slope, temperature, state.covariance[0])
@@ -375,7 +384,7 @@ class BatteryPack:
         share = min(max(current * dt / fresh, -1.0), 1.0)  # a gap of years is no charge
         walks = AGE.capacity_walk * abs(share), AGE.resistance_walk * abs(share)
         state = self._backend.predict(state, share, v1, Noise(variance, error, error_decay, *walks))
-        self._believed = state = bounded(state)
+        self.state = state = bounded(state)
         self._cell = Cell.of(battery, state.soc, temperature)
 
     def _reads_zero(self, now: float, dt: float, reading: PackReading) -> bool:
@@ -389,18 +398,18 @@ class BatteryPack:
         self, now: float, dt: float, measured: tuple[float, float], reading: PackReading, temperature: float
     ) -> None:
         """Condition the state on a voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
-        battery, cell, effects, noise, test = self._battery, self._cell, self.effects, self.voltage_noise, self.test
+        battery, cell, effects, noise, test = self.battery, self._cell, self.effects, self.voltage_noise, self.test
         voltage, pack_current = measured
         shown, current = battery.cell_voltage(voltage, pack_current), pack_current / battery.cells_parallel
         drop = cell.r0 * current + effects.overpotential
         self._follow_sag(now, dt, voltage, pack_current, reading)
-        self._believed = state = self.age.permit(now, reading, self._signals, self._believed)
+        self.state = state = self.age.permit(now, reading, self._signals, self.state)
         if replaced := self.age.another_pack(state):
-            self._believed = state = replaced
-            self.another_pack = True
+            self.state = state = replaced
+            self.weakest.begin_anew()
         if dt <= self._signals.pause and self._take_rest(dt, shown, current, reading, temperature):
             return
-        state = self._believed
+        state = self.state
         # The voltage without the effects in the cells, which are known.
         emf = shown + effects.mean_overpotential + self._v1_lag + state.v1
         error = emf - cell.ocv + cell.r0 * current
@@ -421,15 +430,15 @@ class BatteryPack:
             # An error that stays for a time counts as one sample in that time, not one each step.
             variance *= max(2 * time / max(dt, 0.02), 1.0)
             self._take_voltage(emf, current, temperature, variance)
-        if test.misfit > PACK.misfit and not test.off and (doubted := self.age.doubted(self._believed)):
-            self._believed, test.misfit = doubted, 1.0
+        if test.misfit > PACK.misfit and not test.off and (doubted := self.age.doubted(self.state)):
+            self.state, test.misfit = doubted, 1.0
         if not test.off:
-            self._believed = self.age.load(self._believed, min(dt, self._signals.pause), drop + state.v1, error)
-        self.age.follow(self._believed, dt)
+            self.state = self.age.load(self.state, min(dt, self._signals.pause), drop + state.v1, error)
+        self.age.follow(self.state, dt)
 
     def _follow_sag(self, now: float, dt: float, voltage: float, current: float, reading: PackReading) -> None:
         """Compare the changes of the voltage with those that a measured current explains, for the sensor checks."""
-        battery, lost, explaining = self._battery, self.effects.overpotential, current
+        battery, lost, explaining = self.battery, self.effects.overpotential, current
         if reading.source not in (CurrentSource.PACK, CurrentSource.INVERTER):
             if reading.reported_current is None:
                 return
@@ -442,7 +451,7 @@ class BatteryPack:
 
     def _take_rest(self, dt: float, volts: float, current: float, reading: PackReading, temperature: float) -> bool:
         """Condition the state on a rest that is better proven than before; returns whether it did."""
-        battery, cell, state, noise = self._battery, self._cell, self._believed, self.voltage_noise
+        battery, cell, state, noise = self.battery, self._cell, self.state, self.voltage_noise
         emf = volts + cell.r0 * current + self.effects.overpotential
         found = self._rest.step(dt, volts, current / battery.capacity, emf, cell.time, noise.model)
         if found is None:
@@ -457,7 +466,7 @@ class BatteryPack:
         soc_variance = (soc_width(battery, emf, sqrt(new), temperature) / 2) ** 2
         least = self.age.least_variance(state, state.soc, cell.slope)
         state = self._backend.condition(state, (1.0, 0.0, 0.0), residual, soc_variance, least)
-        self._believed = state = bounded(state)
+        self.state = state = bounded(state)
         self._cell = Cell.of(battery, state.soc, temperature)
         return True
 
@@ -466,7 +475,7 @@ class BatteryPack:
 
         Where that moves the state of charge far, the slope is taken at its new place.
         """
-        state, cell = self._believed, self._cell
+        state, cell = self.state, self._cell
         at = state.soc
         least = self.age.least_variance(state, at, cell.slope)
         for _ in range(PACK.turns):
@@ -476,8 +485,8 @@ class BatteryPack:
             before, at = at, after.soc
             if abs(at - before) < PACK.near:
                 break
-            cell = Cell.of(self._battery, at, temperature)
-        self._believed, self._cell = bounded(after), cell
+            cell = Cell.of(self.battery, at, temperature)
+        self.state, self._cell = bounded(after), cell
 
     # --- starts -----------------------------------------------------------------------------------------------
 
@@ -487,10 +496,10 @@ class BatteryPack:
         Where tables that are wrong for these cells explain it, as in the cold, a loaded voltage proves nothing: the
         state of charge is as uncertain as it is contradicted until a rest. Otherwise the filter starts again.
         """
-        state = self._believed
+        state = self.state
         if abs(error) < PACK.drop_factor * abs(drop):
-            apart = self._battery.soc_at(self._battery.ocv(state.soc)[0] + error) - state.soc
-            self._believed = bounded(with_wider_soc(state, apart * apart))
+            apart = self.battery.soc_at(self.battery.ocv(state.soc)[0] + error) - state.soc
+            self.state = bounded(with_wider_soc(state, apart * apart))
             self.test.blame_model(known)
             return
         self._wait(None, None)
@@ -507,7 +516,7 @@ class BatteryPack:
     def doubt(self, now: float, is_doubted: bool) -> None:
         """Start again if the voltage is doubted for the first time soon after the start: it has misled the filter."""
         if is_doubted and not self._was_doubted and now - self._started < PACK.doubted_start_s:
-            self._believed, past, age = self._started_from
+            self.state, past, age = self._started_from
             self._wait(past, age)
         self._was_doubted = is_doubted
 
@@ -522,14 +531,14 @@ class BatteryPack:
             self._gap = None
             return
         if self._gap is None and (is_blind or is_gap):
-            self._gap = now - dt, self._believed, self._now._replace(consumption=price)
+            self._gap = now - dt, self.state, self._now._replace(consumption=price)
         if self._gap is None or (is_blind and not is_gap):
             return
         (began, state, past), self._gap = self._gap, None
         if now - began > PRIOR.bridge_s:
             if self.effects and is_gap:
-                self.effects.step(dt, 0.0, state.soc, temperature)
-            self._believed = state
+                self.effects.step(self.battery, dt, 0.0, state.soc, temperature)
+            self.state = state
             self._wait(past, now - began)
 
     def wait(self, seconds: float) -> None:
@@ -537,7 +546,7 @@ class BatteryPack:
         if self.past and self.past_age is not None:
             self.past_age += seconds
             self._unseen = min(self._unseen + seconds, STOOD)
-            self.effects.rest(seconds, self._believed.soc)
+            self.effects.rest(self.battery, seconds, self.state.soc)
 
     def _await_first(
         self,
@@ -552,7 +561,7 @@ class BatteryPack:
 
         Riders pull away within a second: the first voltage is the one at rest, the charge since is counted.
         """
-        battery, signals, current = self._battery, self._signals, reading.current or 0.0
+        battery, signals, current = self.battery, self._signals, reading.current or 0.0
         first, pause = self._first, max(2 * PACK.slow_signals_s, self._signals.pause)
         if first is None or now - self._looked > pause:
             first = First(now, voltage, current, None)
@@ -581,17 +590,18 @@ class BatteryPack:
 
     def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: RidingModel) -> None:
         """Start from the `first` voltage and the state that was believed."""
-        battery, effects, past = self._battery, self.effects, self.past
+        battery, effects, past = self.battery, self.effects, self.past
         power = riding.power_of_prior(now)
         if effects and self._unseen:
             load = first.current
             if first.moving and not past:
-                effects.step(PACK.joined_s, power / first.voltage / battery.cells_parallel, HALF_FULL, temperature)
+                before = power / first.voltage / battery.cells_parallel
+                effects.step(battery, PACK.joined_s, before, HALF_FULL, temperature)
             elif not first.moving:
                 load = standing_load(load, first.voltage, self._auxiliary_power)
-            effects.step(self._unseen, load / battery.cells_parallel, HALF_FULL, temperature)
+            effects.step(battery, self._unseen, load / battery.cells_parallel, HALF_FULL, temperature)
             self._unseen = 0.0
-        self._started, self._started_from = now, (self._believed, past, self.past_age)
+        self._started, self._started_from = now, (self.state, past, self.past_age)
         self._joined = bool(first.moving) and not past
         first = first._replace(
             temperature=temperature,
@@ -603,21 +613,22 @@ class BatteryPack:
 
         def least_variance(soc: float) -> float:
             self.age.is_learning = True
-            return self.age.least_variance(self._believed, soc, battery.ocv(soc)[1])
+            return self.age.least_variance(self.state, soc, battery.ocv(soc)[1])
 
         state = first_state(
-            battery, self.voltage_noise, self._believed, first, past, self.past_age, vehicle, least_variance
+            battery, self.voltage_noise, self.state, first, past, self.past_age, vehicle, least_variance
         )
-        self._believed, self.is_started, self.past, self.past_age = state, True, None, None
+        self.state, self.is_started, self.past, self.past_age = state, True, None, None
         self.age.apply(state)
-        self._cell = Cell.of(battery, state.soc, temperature)
+        self._follow_age()
+        self._cell = Cell.of(self.battery, state.soc, temperature)
         self._advance(now - first.time, (first.current + (reading.current or 0.0)) / 2, 1e-9, temperature)
 
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
         """The state and the vehicle, to be kept over a restart; `learned_snapshot` is kept besides."""
-        state = self._believed
+        state = self.state
         return {
             "soc": min(max(state.soc, 0.0), 1.0),
             "soc_variance": state.covariance[0],
@@ -630,16 +641,18 @@ class BatteryPack:
         }
 
     def learned_snapshot(self) -> dict[str, Any]:
-        """Capacity and resistance, to be kept over a restart."""
-        return self.age.snapshot(self._believed)
+        """Capacity, resistance and weakest group, to be kept over a restart."""
+        return {**self.age.snapshot(self.state), "weakest": self.weakest.snapshot()}
 
     def restore(self, saved: Mapping[str, Any], age: float | None) -> None:
         """Continue from a saved state, which was checked and is `age` [s] old (None: unknown).
 
         ValueError if it holds a state that no filter has, or if it is of other effects.
         """
-        self.effects.restore(saved["cell_effects"], age, saved["soc"])
-        self._believed = self.age.restored(saved)
+        self.weakest.restore(saved["learned"]["weakest"])
+        self.state = self.age.restored(saved)
+        self._follow_age()
+        self.effects.restore(self.battery, saved["cell_effects"], age, saved["soc"])
         self.past = Past(*(saved[name] for name in Past._fields))
         self.past_age, self._unseen = age, STOOD if age is None else min(age, STOOD)
         self._signals.resume({"odometer": saved["odometer"], "bms_state_of_charge": saved["own_soc"]})

@@ -47,7 +47,7 @@ class CellEffects:
     """The states of the effects. False if the model has none."""
 
     def __init__(self, model: Model, battery: Battery) -> None:
-        self._battery = battery
+        self._health = battery.health  # at the last step
         self._effects = [(x.effect.name, x, share_that_ages(x)) for x in model.at(Port.CELL_VOLTAGE)]
         self._quantities = dict.fromkeys(QUANTITIES, 0.0)
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
@@ -60,13 +60,19 @@ class CellEffects:
         return bool(self._effects)
 
     def step(
-        self, dt: float, current: float, soc: float, temperature: float, others: Mapping[str, float] | None = None
+        self,
+        battery: Battery,
+        dt: float,
+        current: float,
+        soc: float,
+        temperature: float,
+        others: Mapping[str, float] | None = None,
     ) -> None:
         """`dt` [s] on at a mean cell `current` [A], `temperature` in degC; others: what else has changed, by name."""
-        q = self._quantities
+        q, self._health = self._quantities, battery.health
         q.update(others or {})
         q["soc"], q["cell_temperature"] = soc, temperature
-        q["cell_capacity"] = self._battery.cell_capacity(temperature)
+        q["cell_capacity"] = battery.cell_capacity(temperature)
         self.states = self._after(self.states, dt, current, q)
         before, self.overpotential = self.overpotential, sum(self.states.values())
         self.mean_overpotential = (before + self.overpotential) / 2 if dt <= 2 * WINDOW else self.overpotential
@@ -87,23 +93,23 @@ class CellEffects:
     def _after(
         self, states: Mapping[str, float], dt: float, current: float, quantities: dict[str, float]
     ) -> dict[str, float]:
-        health, after = self._battery.health, {}
+        after = {}
         for name, effect, ages in self._effects:
-            quantities["cell_current"] = health.carried(current, ages)
+            quantities["cell_current"] = self._health.carried(current, ages)
             after[name] = effect.step(states[name], dt, quantities)
         return after
 
-    def restore(self, saved: Mapping[str, float], age: float | None, soc: float) -> None:
+    def restore(self, battery: Battery, saved: Mapping[str, float], age: float | None, soc: float) -> None:
         """Continue from the `saved` states after a rest of `age` [s], None: long. ValueError for other effects."""
         if saved.keys() != self.states.keys():
             raise ValueError("is damaged: state.cell_effects has not the effects of this vehicle")
         self.states = dict(saved)
-        self.rest(FOREVER if age is None else age, soc)
+        self.rest(battery, FOREVER if age is None else age, soc)
 
-    def rest(self, seconds: float, soc: float) -> None:
+    def rest(self, battery: Battery, seconds: float, soc: float) -> None:
         """So much time [s] without a load, at a temperature that is not known."""
         if self.states:
-            self.step(seconds, 0.0, soc, MILD)
+            self.step(battery, seconds, 0.0, soc, MILD)
 
 
 class Temperatures:

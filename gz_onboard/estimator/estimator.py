@@ -25,7 +25,6 @@ from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackRead
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.saved_state import VERSION, Each, Number, Text, check, check_vehicle
 from gz_onboard.estimator.signals import TIMING, Signals
-from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
@@ -74,15 +73,11 @@ class Estimator:
     def __init__(
         self, groups: Sequence[Group], battery: Battery, model: Model, riding: PriorRiding, backend: Backend = SCALAR
     ) -> None:
-        self.battery = battery = battery.own()  # what is learned of its age is of this one
-        self.forecaster = Forecaster(model, battery, riding)
         self.signals = Signals(groups, battery.window.of_cells)
         p = model.parameters
         self.motion = Motion(self.signals, p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"])
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.explainer = RangeExplainer(self.forecaster)
-        self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
@@ -95,7 +90,9 @@ class Estimator:
         self.plausibility = Plausibility(self.signals, battery, p, model.mass, *models)
         self._temperatures = Temperatures(self.signals, p)
         self.pack = BatteryPack(battery, model, backend, self.signals, self.plausibility.pack.sag)
-        self.forecaster.pack, self.weakest = self.pack, WeakestGroup(battery, self.signals, p)
+        self.forecaster = Forecaster(model, battery, riding, self.pack)
+        self.explainer = RangeExplainer(self.forecaster)
+        self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
         self._load = PresentLoad(
             self.forecaster.load, self.motion, self._temperatures, self.pack, self._vibration, self.signals
         )
@@ -103,7 +100,7 @@ class Estimator:
     @property
     def filter(self) -> FilterState | None:
         """State of the battery filter; None before the first voltage."""
-        return self.pack.state
+        return self.pack.state if self.pack.is_started else None
 
     def vibration(self, now: float) -> float:
         """Return the ``vibration`` that effects read [m/s²] at `now` [s]: a typical value while it is unknown."""
@@ -141,7 +138,6 @@ class Estimator:
         temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= self.signals.pause else None)
         self.pack.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
         self.pack.step(now, dt, self._reading, temperature, motion.speed, self._load)
-        self.weakest.step(now, self._reading, temperature, self.pack)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         if self.filter is None:
@@ -222,7 +218,7 @@ class Estimator:
     def _follow_activity(self, now: float, dt: float) -> None:
         signals, current = self.signals, self._reading.current
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
-        capacity = self.battery.pack_capacity(self._temperatures.cells_or_bench)
+        capacity = self.pack.battery.pack_capacity(self._temperatures.cells_or_bench)
         rate, drive = (None if x is None else x / capacity for x in (known, signals.inverter_current.get(now)))
         rides = abs(self.motion.speed or 0.0) > MOVING  # then nobody asks
         silent = not rides and bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
@@ -302,7 +298,7 @@ class Estimator:
         if filter_ is None:
             estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
             return estimate
-        estimate.soc, estimate.soc_sd = self.battery.window.shown(*self.pack.soc)
+        estimate.soc, estimate.soc_sd = self.pack.battery.window.shown(*self.pack.soc)
         estimate.v1, estimate.innovation_rms = filter_.v1, sqrt(self.pack.test.square)
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
@@ -350,7 +346,7 @@ class Estimator:
 
     def learned_snapshot(self) -> dict[str, Any]:
         """Return the learned age of the pack, a part of the saved state."""
-        return {**self.pack.learned_snapshot(), "weakest": self.weakest.snapshot()}
+        return self.pack.learned_snapshot()
 
     def wait(self, seconds: float) -> None:
         """Age the restored state by `seconds` [s] in which no voltage has come."""
@@ -365,7 +361,6 @@ class Estimator:
         check(FIELDS, saved)
         age = age if age is not None and 0 <= age < inf else None  # a clock that was set tells no age
         self.forecaster.restore(saved["riding"])
-        self.weakest.take_on(self.weakest.read(saved["learned"]["weakest"]))
         bias_x, bias_z = saved["gyro_bias"]
         self.motion.gyro_bias = bias_x, bias_z
         if saved["cell_temperature"] is not None and age is not None and age < CELLS_KEEP:

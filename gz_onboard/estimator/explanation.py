@@ -82,7 +82,7 @@ class RangeExplainer:
 
     def __init__(self, forecaster: Forecaster) -> None:
         self._forecaster, self._load = forecaster, forecaster.load
-        self._new = forecaster.battery.own()
+        self._new = forecaster.new_battery
         self._since: RangeState | None = None
         self._forgotten: set[str] = set()  # roles, since then
         self._news: deque[tuple[bool, Explanation]] = deque(maxlen=CONFIG.max_changes)
@@ -143,10 +143,7 @@ class RangeExplainer:
         hills: tuple[float, float] = (0.0, 0.0),
     ) -> RangeState:
         """The state that the range of a `forecast` follows from; see `take`."""
-        forecaster, pack = self._forecaster, self._new.own()
-        learner, health = forecaster.learner, forecaster.battery.health
-        pack.age(health.capacity, health.resistance)
-        pack.weaken(health.weakest)
+        learner = self._forecaster.learner
         known = forecast.range > 0 and forecast.energy > 0
         consumption = forecast.energy / forecast.range if known else forecast.consumption
         unit, parts = sum(self._load.prior_prices(air.ambient, air.altitude)), self._parts()
@@ -161,7 +158,7 @@ class RangeExplainer:
             form_factor_squared=forecast.form_factor_squared,
             soc=soc,
             cells=forecast.cells,
-            battery=pack,
+            battery=self._forecaster.battery,
             unit=unit,
             payload=1.0,
             parts=parts,

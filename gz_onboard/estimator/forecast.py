@@ -216,14 +216,14 @@ class _Discharge(NamedTuple):
 class Forecaster:
     """Forecasts the range of one vehicle."""
 
-    def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
+    def __init__(self, model: Model, battery: Battery, prior: PriorRiding, pack: BatteryPack | None = None) -> None:
+        """pack: how it has aged; None: it is known to be as its file says, which is `battery`."""
         self.learner = ConsumptionLearner(model, battery, prior)
         self.load = self.learner.load
-        self.battery = battery
+        self.new_battery, self._pack = battery, pack
         self.smoother = RangeSmoother()
-        self.pack: BatteryPack | None = None  # None: the pack is known to be as its file says
         self.cooling = pack_constants(model.parameters)
-        self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
+        self._ahead = {"vibration": prior.vibration, "time_moving": AHEAD}  # inputs of effects in the cells
         p = model.parameters
         self._cutoff_sd, self._empty_sd = p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty")  # V
         self._discharge: _Discharge | None = None  # the last one
@@ -235,6 +235,11 @@ class Forecaster:
         self._to_full: float | None = None  # s
         self._full: Forecast | None = None  # while charging
         self._shown_at, self._rides = 0.0, 0  # distance [m] and rides of the learner at the last displayed forecast
+
+    @property
+    def battery(self) -> Battery:
+        """The pack as it is believed to be now."""
+        return self._pack.battery if self._pack else self.new_battery
 
     def forget(self, distance: float) -> None:
         """Unlearn the last `distance` [m]: a sensor that it was learned, and the display computed, from is faulty."""
@@ -278,7 +283,7 @@ class Forecaster:
             + (self._cutoff_sd**2 + max(self._empty_sd, left.end_drop_sd) ** 2) * left.by_cutoff**2
         )
         fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
-        of_pack = self.pack.energy_sd(left.energy, left.slope, soc_sd) if self.pack else (fresh, fresh)
+        of_pack = self._pack.energy_sd(left.energy, left.slope, soc_sd) if self._pack else (fresh, fresh)
         down, up = (sqrt(of_end + sd * sd) for sd in of_pack)
         variance = min(loss_variance + expected.variance, FORECAST.most_sd**2)
         p10, p90 = deciles(left.energy, down, up, variance)
@@ -311,9 +316,10 @@ class Forecaster:
                     energy += FORECAST.cells_stay * last.lost_colder / sd * moved[1]
                 return last._replace(left=last.left._replace(energy=energy))
         soc, temperature, sd, ambient, log_power, form_factor_squared = now
-        load = exp(log_power), form_factor_squared
-        cells = cells_ahead(self.battery, self.cooling, (soc, temperature), ambient, load, self._overpotential)
-        left, colder = (drawable(self.battery, soc, at, *load, self._overpotential) for at in (cells, cells - sd))
+        load, battery = (exp(log_power), form_factor_squared), self.battery
+        lost = self.load.model.overpotential(battery, self._ahead)
+        cells = cells_ahead(battery, self.cooling, (soc, temperature), ambient, load, lost)
+        left, colder = (drawable(battery, soc, at, *load, lost) for at in (cells, cells - sd))
         self._discharge = _Discharge(inputs, health.weakest, cells, left, left.energy - colder.energy)
         return self._discharge
 

@@ -196,7 +196,7 @@ class PresentLoad:
         ambient, altitude = self._temperatures.ambient(now), motion.altitude or 0.0
         if not self._load.extended:
             return Conditions(ambient, altitude, WARM_MOTOR if motor is None else motor)
-        state, turning = self._pack.state, motion.yaw_rate is not None and motion.speed is not None
+        turning = motion.yaw_rate is not None and motion.speed is not None
         return Conditions(
             ambient,
             altitude,
@@ -204,7 +204,7 @@ class PresentLoad:
             (motion.speed or 0.0) * (motion.yaw_rate or 0.0) if turning else None,
             motion.heading,
             self._monitor.value(now) if self._monitor else None,
-            state.soc if state else HALF_FULL,
+            self._pack.state.soc,
             self._temperatures.cells_or_bench,
             self._pack.current or 0.0,
         )

@@ -26,7 +26,7 @@ from gz_onboard.estimator.battery_priors import PRIOR, bounded
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.physics.battery import MOST_SOC_SD, QUICK, Battery
+from gz_onboard.physics.battery import MOST_SOC_SD, QUICK, Battery, Health
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _quantile(share: float, kinds: tuple[tuple[float, float, float], ...]) -> fl
 
 
 class PackAge:
-    """Follows one pack's age. Takes the filter's state and returns it; gives the belief to the `Battery`."""
+    """Follows one pack's age: takes the filter's state and returns it. `health`: the age as it is believed."""
 
     def __init__(self, battery: Battery, backend: Backend) -> None:
         self._battery, self._backend = battery, backend
@@ -159,18 +159,18 @@ class PackAge:
     # --- the belief -------------------------------------------------------------------------------------------
 
     def apply(self, state: FilterState) -> None:
-        """Form the belief and give it to the battery."""
+        """Form the belief."""
         factor, variance = self._proven[0]
         told = max(1 / variance - 1 / AGE.aged_resistance_sd**2, 1e-9)
         by_table = max(PRIOR.resistance_sd, self._battery.resistance_sd) ** 2
         self.belief = believe(self._battery.as_new, self._new_sd, state, factor, 1 / told + by_table)
         change = factor - 1
         # A change that is small against the tables' own error is mostly that error (a Wiener filter).
-        self.resistance = 1 + change**3 / (change**2 + PRIOR.resistance_sd**2)
+        resistance = 1 + change**3 / (change**2 + PRIOR.resistance_sd**2)
         # Of the packs that are as new, no resistance is to be learned.
         unknown = (1 - self._battery.as_new) * state.covariance[9]
         self.resistance_sd = sqrt(unknown + (state.resistance - factor) ** 2)
-        self._battery.age(1 / self.belief.inverse, self.resistance)
+        self.health = Health(1 / self.belief.inverse, resistance)
 
     def published(self, state: FilterState) -> tuple[float, float]:
         """(SOC, its standard deviation) with the belief of the capacity."""
@@ -202,7 +202,7 @@ class PackAge:
         resistance_sd = sqrt(self.resistance_sd**2 + by_table)
         return {
             "capacity": LearnedFactor(factor, sd * factor * factor, 1 - sqrt(left / self._unknown)),
-            "resistance": LearnedFactor(self.resistance, resistance_sd, max(known, 0.0)),
+            "resistance": LearnedFactor(self.health.resistance, resistance_sd, max(known, 0.0)),
         }
 
     # --- learning ---------------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ class PackAge:
 
     def load(self, state: FilterState, dt: float, drop: float, error: float) -> FilterState:
         """Learn the resistance over `dt` [s] from the `drop` predicted and the `error` measured minus predicted [V]."""
-        unit, measured = drop / self._battery.health.resistance, drop - error
+        unit, measured = drop / self.health.resistance, drop - error
         share = min(dt / QUICK, 1.0)
         slow, slow_measured = self._slow
         self._slow = slow + share * (unit - slow), slow_measured + share * (measured - slow_measured)

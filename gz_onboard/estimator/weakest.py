@@ -21,10 +21,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, inf, isfinite, sqrt
+from math import hypot, inf, sqrt
 from typing import Any
 
-from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.pack_age import SAME, LearnedFactor
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import FINITE, Each, Number
@@ -153,7 +152,7 @@ class GroupBelief:
 
 
 class WeakestGroup:
-    """Learns the differences of one pack's weakest group, and gives them to its `Battery`."""
+    """Learns the differences of one pack's weakest group. `group`: as it is used; None while too little is known."""
 
     def __init__(self, battery: Battery, signals: Signals, parameters: Parameters) -> None:
         self._battery, self._signals, self._signal = battery, signals, signals.lowest_cell_voltage
@@ -162,12 +161,13 @@ class WeakestGroup:
         self._above = CONFIG.above + 2 * offset_sd
         self._seen_at = self._steady_since = -inf  # s
         self._steady_at = inf  # V about which the mean cell's voltage has held since
-        self._begin_anew()
+        self.begin_anew()
 
-    def _begin_anew(self) -> None:
-        """Nothing is known of the pack."""
+    def begin_anew(self) -> None:
+        """Know nothing of the pack: it is another one."""
         self.known = self._undoubted = GroupBelief.unknown(self._prior_sd)
         self._block, self._doubt, self.refused = VoltageBlock(), 0.0, False
+        self.group: WeakGroup | None = None
 
     @property
     def mapped(self) -> bool:
@@ -182,7 +182,7 @@ class WeakestGroup:
         shares = (max(1 - known.sd(i) / sd, 0.0) for i, sd in enumerate(CONFIG.prior_sd))
         return {name: LearnedFactor(*x) for name, *x in zip(NAMES, factors, sds, shares, strict=True)}
 
-    def believed(self) -> WeakGroup | None:
+    def _used(self) -> WeakGroup | None:
         """The group as used; a difference that is small against its sd and healthy groups' spread counts little."""
         known = self.known
         if known.blocks < CONFIG.proven:
@@ -196,14 +196,22 @@ class WeakestGroup:
 
     # --- learning ---------------------------------------------------------------------------------------------
 
-    def step(self, now: float, reading: PackReading, temperature: float, pack: BatteryPack) -> None:
-        """Take in the window that ends at `now` [s]; temperature: of the cells [degC]."""
-        if pack.another_pack:
-            self._begin_anew()
-            self._battery.weaken(None)
-        if not self.mapped or reading.voltage is None or reading.current is None or pack.state is None:
+    def step(
+        self,
+        now: float,
+        reading: PackReading,
+        temperature: float,
+        battery: Battery,
+        soc: tuple[float, float],
+        overpotential: float,
+    ) -> None:
+        """Take in the window that ends at `now` [s]; temperature: of the cells [degC].
+
+        battery: with its age. soc: of the mean cell, and its sd; overpotential: beyond the drop over its R0 [V].
+        """
+        if reading.voltage is None or reading.current is None:
             return
-        battery, signals = self._battery, self._signals
+        signals = self._signals
         is_new, self._seen_at = self._signal.time > self._seen_at, self._signal.time
         mean = battery.cell_voltage(reading.voltage, reading.current)
         if abs(mean - self._steady_at) > CONFIG.steady:
@@ -212,13 +220,13 @@ class WeakestGroup:
         sound = sound and signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
         if not is_new or not sound or now - self._steady_since < CONFIG.steady_s:
             return
-        place, sd = pack.soc
+        place, sd = soc
         current = reading.current / battery.cells_parallel
         if sd > CONFIG.max_soc_sd or current < 0:  # while charging the lowest is another group
             return
         if not -CONFIG.block < self._block.began - place < CONFIG.place:  # the first, after a charge, or a new SOC
             self._block = VoltageBlock(place)
-        drop = battery.r0.at(place, temperature)[0] * current + pack.effects.overpotential + pack.state.v1
+        drop = battery.r0.at(place, temperature)[0] * current + overpotential
         self._block.add(self._signal.value, mean, drop)
         if self._block.began - place >= CONFIG.block and self._block.count >= CONFIG.min_samples:
             block, self._block = self._block, VoltageBlock(place)
@@ -235,11 +243,11 @@ class WeakestGroup:
             self.known = learned
         behind, sd = self.known.behind(1 - soc)
         if self.known.blocks >= CONFIG.proven and soc - behind + 2 * sd < -CONFIG.past_empty:
-            self._begin_anew()
+            self.begin_anew()
             self.refused, self._doubt = True, 1.0
         if self._doubt < CONFIG.trusted_below:
             self._undoubted = self.known
-        self._battery.weaken(self.believed())
+        self.group = self._used()
 
     def _learned_from(self, block: VoltageBlock, soc: float) -> GroupBelief | None:
         """The belief after a block; None if no group can have had such voltages."""
@@ -277,33 +285,24 @@ class WeakestGroup:
         known = self.known
         return {"of": self._battery.capacity, "means": known.means, "rows": known.rows, "blocks": known.blocks}
 
-    def read(self, saved: Mapping[str, Any] | None) -> GroupBelief:
-        """The belief in a snapshot: nothing learned if there is none, or if it is of another pack.
-
-        KeyError, TypeError or ValueError if it holds what cannot be.
-        """
-        unknown = GroupBelief.unknown(self._prior_sd)
-        if saved is None or not abs(float(saved["of"]) / self._battery.capacity - 1) <= SAME:
-            return unknown
-        means = tuple(map(float, saved["means"]))
-        rows = tuple(tuple(map(float, row)) for row in saved["rows"])
-        found, most = GroupBelief(means, rows, int(saved["blocks"])), 1.001  # of rounding
-        fits = [len(means), *map(len, rows)] == [4] * 5 and all(map(isfinite, means)) and found.within_limits() == found
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Continue from a snapshot, which was checked, unless it is of another pack. ValueError if it cannot be."""
+        if abs(saved["of"] / self._battery.capacity - 1) > SAME:
+            return
+        found = GroupBelief(tuple(saved["means"]), tuple(map(tuple, saved["rows"])), int(saved["blocks"]))
+        rows, most = found.rows, 1.001  # of rounding
+        fits = [len(found.means), *map(len, rows)] == [4] * 5 and found.within_limits() == found
         for i, row in enumerate(rows if fits else ()):
-            fits &= 0 < row[i] <= most * unknown.rows[i][i]
+            fits &= 0 < row[i] <= most * self.known.rows[i][i]
             fits &= all(p * p <= most * row[i] * rows[j][j] for j, p in enumerate(row))
-        if not fits or found.blocks < 0:
+        if not fits:
             raise ValueError("holds an implausible weakest group")
-        return found
-
-    def take_on(self, saved: GroupBelief) -> None:
-        """Continue from the belief that `read` gave."""
-        self.known = self._undoubted = saved
-        self._battery.weaken(self.believed())
+        self.known = self._undoubted = found
+        self.group = self._used()
 
 
 FIELDS = {"of": FINITE, "means": Each(FINITE, 4), "rows": Each(Each(FINITE, 4), 4), "blocks": Number(0.0)}
-"""Of the saved state; `WeakestGroup.read` knows their bounds."""
+"""Of the saved state; `WeakestGroup.restore` knows their bounds."""
 
 
 def _trusted(difference: float, sd: float) -> float:

@@ -129,7 +129,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     changes = pipeline.estimator.explainer.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     own = pipeline.estimator.signals["bms_state_of_charge"].last  # of the cells
-    battery, gauge = pipeline.estimator.battery, tally.gauge
+    battery, gauge = pipeline.estimator.pack.battery, tally.gauge
     counted = gauge.first is not None and gauge.uncounted <= MOST_SLOW * (last.time - tally.paused)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()

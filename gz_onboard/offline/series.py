@@ -73,7 +73,7 @@ def bilinear_over(xs: Array, ys: Array, table: Array, x: Array, y: Array, geomet
 def mesh_over(mesh: Mesh, soc: Array, temperature: Array) -> Array:
     """The values of `mesh` at `soc` and `temperature` [degC], both (m,)."""
     nodes = np.array(mesh.soc), np.array(mesh.temperature), np.array(mesh.value)
-    return mesh.scale * bilinear_over(*nodes, soc, temperature, mesh.geometric)
+    return bilinear_over(*nodes, soc, temperature, mesh.geometric)
 
 
 def ocv_over(battery: Battery, soc: Array, temperature: Array) -> Array:

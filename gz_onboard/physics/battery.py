@@ -100,7 +100,7 @@ class WeakGroup:
         return mean - self.charge - self.capacity * (1 - mean)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Health:
     """How a pack has aged, as factors on what its file says; every equation of `Battery` has them in it."""
 
@@ -141,7 +141,7 @@ class Battery:
     voltage_error_time_curve: PiecewiseLinear | None = None  # s, over degC; None: the same at all temperatures
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
-    health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
+    health: Health = Health()  # see `aged`
 
     @cached_property
     def _soc_of_ocv(self) -> PiecewiseLinear:
@@ -244,24 +244,11 @@ class Battery:
             resistance_factor=factor,
         )
 
-    def own(self) -> Battery:
-        """A copy that may `age` by itself; it is as new."""
-        r0, r1, c1 = (table.scaled(1.0) for table in (self.r0, self.r1, self.c1))
-        return replace(self, r0=r0, r1=r1, c1=c1, health=Health())
-
-    def age(self, capacity: float, resistance: float) -> None:
-        """From now on the pack has so many times the capacity and the resistance that its file says.
-
-        In place: who holds the battery sees it. Call it for a copy of one's `own` only.
-        """
-        self.health.capacity, self.health.resistance = capacity, resistance
-        self.r0.rescale(resistance)
-        self.r1.rescale(resistance)
-        self.c1.rescale(1 / resistance)  # the time constant stays
-
-    def weaken(self, weakest: WeakGroup | None) -> None:
-        """From now on one group is weaker than the mean cell by so much. In place, as `age`."""
-        self.health.weakest = weakest
+    def aged(self, health: Health) -> Battery:
+        """The pack as it is when it has aged so."""
+        r = health.resistance / self.health.resistance
+        r0, r1, c1 = self.r0.scaled(r), self.r1.scaled(r), self.c1.scaled(1 / r)  # the time constant stays
+        return replace(self, r0=r0, r1=r1, c1=c1, health=health)
 
     def settled_current(
         self,

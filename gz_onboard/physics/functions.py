@@ -108,13 +108,12 @@ class PiecewiseLinear:
 
 @dataclass(eq=False)
 class Mesh:
-    """Values over SOC (columns) and temperature [degC] (rows), read times `scale`."""
+    """Values over SOC (columns) and temperature [degC] (rows)."""
 
     soc: Row
     temperature: Row
     value: tuple[Row, ...]
     geometric: bool = False  # over temperature; all values are positive then
-    scale: float = 1.0  # changed by `rescale` only
 
     def __post_init__(self) -> None:
         self._rows: dict[float, Segments] = {}  # by temperature, the last few: it changes far more slowly than SOC
@@ -125,14 +124,8 @@ class Mesh:
         start, value, slope = row[bisect_right(self.soc, soc)]
         return value + slope * (soc - start), slope
 
-    def rescale(self, scale: float) -> None:
-        """From now on the table's values are read times `scale`."""
-        if scale != self.scale:
-            self.scale = scale
-            self._rows.clear()
-
     def scaled(self, factor: float) -> Mesh:
-        """Another mesh, of this one's values times `factor`; not rescaled."""
+        """Another mesh, of this one's values times `factor`."""
         values = tuple(tuple(factor * v for v in row) for row in self.value)
         return Mesh(self.soc, self.temperature, values, self.geometric)
 
@@ -142,9 +135,9 @@ class Mesh:
         cold, warm = self.value[j], self.value[min(j + 1, len(ts) - 1)]
         w = min(max((temperature - ts[j]) / (ts[j + 1] - ts[j]), 0.0), 1.0) if len(ts) > 1 else 0.0
         if self.geometric:
-            values = [self.scale * c * (h / c) ** w for c, h in zip(cold, warm, strict=True)]
+            values = [c * (h / c) ** w for c, h in zip(cold, warm, strict=True)]
         else:
-            values = [self.scale * (c + w * (h - c)) for c, h in zip(cold, warm, strict=True)]
+            values = [c + w * (h - c) for c, h in zip(cold, warm, strict=True)]
         if len(self._rows) >= KEPT_ROWS:
             self._rows.clear()
         row = self._rows[temperature] = segments(self.soc, values)

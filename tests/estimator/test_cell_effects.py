@@ -7,6 +7,7 @@ import pytest
 
 from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
+from gz_onboard.physics.battery import Health
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 
@@ -25,7 +26,7 @@ def followed(currents, temperature=COLD):
     """The effects after cell `currents` [A], `DT` each, and their overpotential [V] at each."""
     effects, volts = CellEffects(MODEL, PACK), []
     for before, current in zip([currents[0], *currents[:-1]], currents, strict=True):
-        effects.step(DT, (before + current) / 2, SOC, temperature)
+        effects.step(PACK, DT, (before + current) / 2, SOC, temperature)
         volts.append(effects.overpotential)
     return effects, volts
 
@@ -43,7 +44,7 @@ def test_a_current_that_is_long_another_than_the_one_followed_has_its_own_overpo
     """The pack's sensor is stuck at nothing for half a minute, the inverter's shows what flows."""
     effects, _ = followed([0.0] * 10)
     for k in range(300):
-        effects.step(DT, 0.0, SOC, COLD)
+        effects.step(PACK, DT, 0.0, SOC, COLD)
         shown = effects.supposed("inverter", DT * k, HARD)
     assert effects.overpotential == pytest.approx(0.0, abs=1e-9)
     assert shown == pytest.approx(followed([HARD] * 400)[1][-1], rel=0.01)
@@ -59,12 +60,11 @@ def test_a_current_that_nobody_asked_for_in_a_while_is_followed_anew():
 def test_a_resistance_learned_from_quick_changes_says_nothing_of_what_takes_half_an_hour():
     """The reaction of a cell with half as much resistance more loses more, and slow relaxation what the file says."""
     assert {"charge_transfer", "slow_relaxation"} <= {effect.name for effect in MODEL.effects}
-    aged = PACK.own()
-    aged.age(0.8, 1.5)
+    aged = PACK.aged(Health(0.8, 1.5))
     lost = {}
     for name, pack in (("new", PACK), ("aged", aged)):
         effects = CellEffects(MODEL, pack)
-        effects.step(1e5, GENTLY, SOC, WARM)
+        effects.step(pack, 1e5, GENTLY, SOC, WARM)
         lost[name] = effects.states
         settled = MODEL.overpotential(pack)
         assert settled is not None
@@ -77,12 +77,12 @@ def test_a_resistance_learned_from_quick_changes_says_nothing_of_what_takes_half
 def bursts(seconds):
     """Events of a cold pack of the vehicle's own model: 4 s at 60 A in every 12 s."""
     p, soc, v1, effects, before = VEHICLE.parameters, SOC, 0.0, CellEffects(MODEL, PACK), 1.2
-    effects.step(60.0, before / PACK.cells_parallel, soc, COLD)  # it has stood with its lights on
+    effects.step(PACK, 60.0, before / PACK.cells_parallel, soc, COLD)  # it has stood with its lights on
     for step in range(round(seconds / DT)):
         t = step * DT
         current = 1.2 if t < 10 or t % 12 > 4 else 60.0
         cell = current / PACK.cells_parallel
-        effects.step(DT, (before + current) / 2 / PACK.cells_parallel, soc, COLD)
+        effects.step(PACK, DT, (before + current) / 2 / PACK.cells_parallel, soc, COLD)
         soc, v1, _ = PACK.advanced(DT, soc, v1, (before + current) / 2 / PACK.cells_parallel, COLD)
         before = current
         volts = PACK.pack_voltage(PACK.terminal_voltage(soc, v1, cell, COLD)[0] - effects.overpotential, current)

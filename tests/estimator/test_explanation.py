@@ -198,7 +198,7 @@ def test_bends_of_a_model_that_knows_their_loss_are_named():
 def test_cells_that_have_aged_are_named():
     usual, aged = ridden(), ridden()
     pack = aged.battery
-    aged.battery = replace(pack, capacity=0.8 * pack.capacity, r0=pack.r0.scaled(1.5), r1=pack.r1.scaled(1.5))
+    aged.new_battery = replace(pack, capacity=0.8 * pack.capacity, r0=pack.r0.scaled(1.5), r1=pack.r1.scaled(1.5))
     why = against(aged, usual)
     check_sum(why)
     assert named(why) is Cause.AGE

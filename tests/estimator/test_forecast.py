@@ -17,6 +17,7 @@ from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.saved_state import check
 from gz_onboard.offline.cooling import LumpedCooling
+from gz_onboard.physics.battery import Health
 from gz_onboard.physics.drawable import cells_ahead, pack_constants
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
@@ -422,8 +423,7 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effect
 @pytest.mark.parametrize(("capacity", "resistance"), [(1.0, 1.0), (0.85, 1.35), (0.8, 1.5)])
 def test_in_the_frost_the_range_does_not_fall_over_an_edge(capacity, resistance, temperature):
     """Where cold cells no longer give what bursts ask for: they warm on the way all the same."""
-    pack = VEHICLE.pack.own()
-    pack.age(capacity, resistance)
+    pack = VEHICLE.pack.aged(Health(capacity, resistance))
     f = Forecaster(VEHICLE.model, pack, VEHICLE.riding)
     ranges = [f.forecast(soc, 0.01, temperature, 1.0, temperature, 0.0).range for soc in np.linspace(0.05, 1, 191)]
     assert ranges[-1] > 0.6 * forecast(forecaster(), 1.0).range

@@ -178,7 +178,7 @@ def test_a_voltage_overrules_a_capacity_that_was_learned_and_is_wrong(learned, t
     scooter, e = Scooter(soc=0.95, capacity=true * BATTERY.pack_capacity(25.0), period=0.5, offset=0.0), estimator()
     known = e.pack.age.unknown
     covariance = (*known.covariance[:7], 0.01**2, *known.covariance[8:])
-    e.pack._believed = known._replace(inverse_capacity=1 / learned, covariance=covariance)
+    e.pack.state = known._replace(inverse_capacity=1 / learned, covariance=covariance)
     follow(e, scooter.live(30), scooter)
     while scooter.soc > 0.35:
         rows = follow(e, scooter.live(60, 9.0), scooter)

@@ -16,7 +16,7 @@ from gz_onboard.estimator.battery_priors import bounded
 from gz_onboard.estimator.pack_age import AGE, FIELDS, Belief, PackAge, believe, mixture_variance
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import check
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import Battery, Health
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
 
@@ -34,17 +34,19 @@ def known_signals() -> ShownSignals:
 
 @dataclass
 class Aged:
-    """A pack's age, its battery and the filter's state."""
+    """A pack's age and the filter's state."""
 
     age: PackAge
-    battery: Battery
     state: FilterState
+
+    @property
+    def battery(self) -> Battery:
+        return PACK.aged(self.age.health)
 
     @classmethod
     def new(cls) -> Aged:
-        battery = PACK.own()
-        age = PackAge(battery, SCALAR)
-        return cls(age, battery, age.unknown)
+        age = PackAge(PACK, SCALAR)
+        return cls(age, age.unknown)
 
     def restarted(self) -> Aged:
         """Restored from what is saved, with a state of charge of which nothing is known."""
@@ -64,13 +66,12 @@ def discharge(
     now: float = 0.0,
 ) -> tuple[Aged, float]:
     """(age, true SOC) after a cell that aged so is discharged from full `until` a state of charge."""
-    truth, aged, signals = PACK.own(), aged or Aged.new(), known_signals()
-    truth.age(capacity, resistance)
-    age, battery = aged.age, aged.battery
+    truth, aged, signals = PACK.aged(Health(capacity, resistance)), aged or Aged.new(), known_signals()
+    age = aged.age
     state = with_soc(aged.state, 1.0, 0.005**2)._replace(v1=0.0, error=0.0)
     soc, v1, step = 1.0, 0.0, 0
     while soc > until:
-        current = 0.9 + 0.7 * math.sin(step / 7) + 0.3 * math.sin(step / 61)
+        battery, current = aged.battery, 0.9 + 0.7 * math.sin(step / 7) + 0.3 * math.sin(step / 61)
         soc, v1, _ = truth.advanced(DT, soc, v1, current, WARM)
         voltage = truth.terminal_voltage(soc, v1, current, WARM)[0]
         r1, c1 = battery.r1.at(state.soc, WARM)[0], battery.c1.at(state.soc, WARM)[0]
@@ -172,7 +173,7 @@ def test_a_little_more_resistance_makes_no_other_pack():
 
 def test_a_state_of_another_capacity_is_as_new():
     aged, _ = discharge(0.8, 1.5, 0.6)
-    other = PackAge(replace(PACK, capacity=2.0).own(), SCALAR)
+    other = PackAge(replace(PACK, capacity=2.0), SCALAR)
     saved = {"soc": 0.5, "soc_variance": 0.25, "error_variance": 1e-4, "v1": 0.0}
     state = other.restored(saved | {"learned": aged.age.snapshot(aged.state)})
     assert state.inverse_capacity == 1.0
@@ -198,13 +199,12 @@ def test_it_stays_within_bounds_whatever_comes():
 
 def test_one_vehicle_s_age_is_not_another_s():
     before = PACK.cell_capacity(WARM), PACK.r0.at(0.5, WARM)
-    PACK.own().age(0.7, 2.0)
+    PACK.aged(Health(0.7, 2.0))
     assert (PACK.cell_capacity(WARM), PACK.r0.at(0.5, WARM)) == before
 
 
 def test_ageing_scales_capacity_and_resistance_at_a_kept_time_constant():
-    aged = PACK.own()
-    aged.age(0.8, 1.5)
+    aged = PACK.aged(Health(0.8, 1.5))
     r0, r1, c1 = PACK.circuit(0.5, WARM)
     assert aged.circuit(0.5, WARM) == pytest.approx((1.5 * r0, 1.5 * r1, c1 / 1.5))
     assert aged.pack_capacity(WARM) == pytest.approx(0.8 * PACK.pack_capacity(WARM))

@@ -15,7 +15,7 @@ from tests.estimator.life import BATTERY, VEHICLE, estimator
 
 
 def forecaster() -> Forecaster:
-    return Forecaster(VEHICLE.model, BATTERY.own(), VEHICLE.riding)
+    return Forecaster(VEHICLE.model, BATTERY, VEHICLE.riding)
 
 
 def rides(f: Forecaster, price: float, km: int = 40) -> None:

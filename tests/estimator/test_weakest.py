@@ -18,7 +18,7 @@ from gz_onboard.estimator import forecast
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.weakest import CHARGE, CONFIG, NAMES, VoltageBlock, WeakestGroup
 from gz_onboard.events import Cause, Group
-from gz_onboard.physics.battery import Battery, WeakGroup
+from gz_onboard.physics.battery import Battery, Health, WeakGroup
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, EventEstimator, ShownSignals, events_of
@@ -100,11 +100,11 @@ def at(kind: Hidden, until: float) -> Any:
 
 def left(estimator: Any, weakest: WeakGroup | None) -> float:
     """The energy [J] that it expects to be left, were this known of the weakest group."""
-    known = estimator.battery.health.weakest
-    estimator.battery.weaken(weakest)
+    known = estimator.pack.battery
+    estimator.pack.battery = known.aged(replace(known.health, weakest=weakest))
     soc, sd = estimator.pack.soc
     found = estimator.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0).energy
-    estimator.battery.weaken(known)
+    estimator.pack.battery = known
     return float(found)
 
 
@@ -133,12 +133,12 @@ def test_a_voltage_that_no_cell_has_is_dropped_and_counted(tmp_path: Path, raw: 
 @pytest.mark.parametrize(("kind", "charge", "capacity", "resistance"), [(WEAK, 1.0, 0.92, 1.15), (LOW, 0.96, 1.0, 1.0)])
 def test_a_weak_group_is_found_and_ends_the_range(kind: Hidden, charge: float, capacity: float, resistance: float):
     found = at(kind, 0.2)
-    learned = found.weakest.learned()
+    learned = found.pack.weakest.learned()
     for name, truth in zip(NAMES, (charge, capacity, resistance), strict=True):
         assert abs(learned[name].value - truth) < 2.5 * learned[name].sd
     assert learned["weak_capacity"].sd < 0.025
     whole = drawn(Hidden(), START) / START
-    with_it, without = (left(found, x) - drawn(kind, 0.2) for x in (found.battery.health.weakest, None))
+    with_it, without = (left(found, x) - drawn(kind, 0.2) for x in (found.pack.battery.health.weakest, None))
     assert abs(with_it) < 0.015 * whole
     assert without > 0.03 * whole
 
@@ -146,10 +146,10 @@ def test_a_weak_group_is_found_and_ends_the_range(kind: Hidden, charge: float, c
 def test_a_healthy_pack_has_none():
     for until in (0.55, 0.2):
         found = at(Hidden(), until)
-        assert found.weakest.known.blocks > CONFIG.proven
-        for x in found.weakest.learned().values():
+        assert found.pack.weakest.known.blocks > CONFIG.proven
+        for x in found.pack.weakest.learned().values():
             assert abs(x.value - 1) < 2 * x.sd
-        assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
+        assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
 
 
 def test_without_the_signal_nothing_is_known():
@@ -160,7 +160,7 @@ def test_without_the_signal_nothing_is_known():
         if time > 600:
             break
         estimator.handle((time, group, values[:2]))
-    assert estimator.battery.health.weakest is None
+    assert estimator.pack.battery.health.weakest is None
     assert estimator.snapshot("key")["learned"]["weakest"]["blocks"] == 0
 
 
@@ -174,13 +174,13 @@ def test_the_state_of_charge_stays_the_mean_cell_s():
 
 def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
     found = at(WEAK, 0.2)
-    explainer, weakest, ends = found.explainer, found.battery.health.weakest, []
-    for known in (weakest, None):
-        found.battery.weaken(known)
+    explainer, believed, ends = found.explainer, found.pack.battery, []
+    for known in (believed.health, replace(believed.health, weakest=None)):
+        found.pack.battery = believed.aged(known)
         soc, sd = found.pack.soc
         forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
         ends.append(explainer.state(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0))
-    found.battery.weaken(weakest)
+    found.pack.battery = believed
     with_it, without = (explainer.explain(explainer.rated, end) for end in ends)
     for why in (with_it, without):
         assert sum(why.causes.values()) == pytest.approx(why.range - why.reference, abs=1e-6)
@@ -206,12 +206,13 @@ def fed(battery: Battery, missing: float, soc: tuple[float, float]) -> WeakestGr
 
 def test_a_flat_curve_shows_a_low_group_only_at_its_end():
     flat = tuple(3.2 + 0.03 * z + (0.2 * (z - 0.1) / 0.1 if z < 0.1 else 0.0) for z in VEHICLE.pack.ocv_curve.x)
-    battery = replace(VEHICLE.pack, ocv_curve=replace(VEHICLE.pack.ocv_curve, y=flat)).own()
-    plateau = fed(battery, 0.04, (0.9, 0.3)).learned()["weak_charge"]
+    battery = replace(VEHICLE.pack, ocv_curve=replace(VEHICLE.pack.ocv_curve, y=flat))
+    weakest = fed(battery, 0.04, (0.9, 0.3))
+    plateau = weakest.learned()["weak_charge"]
     assert plateau.sd > 0.9 * CONFIG.prior_sd[CHARGE]
     assert abs(plateau.value - 1) < 0.01
-    assert battery.health.weakest
-    assert battery.health.weakest.charge < 0.002
+    assert weakest.group
+    assert weakest.group.charge < 0.002
     end = fed(battery, 0.04, (0.12, 0.08))
     assert end.known.behind(0.9)[0] == pytest.approx(0.04, abs=0.012)
 
@@ -219,10 +220,10 @@ def test_a_flat_curve_shows_a_low_group_only_at_its_end():
 def test_a_charge_or_a_new_state_of_charge_begins_another_block():
     estimator: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     blocks: list[tuple[VoltageBlock, float]] = []
-    estimator.weakest.take = lambda block, soc: blocks.append((block, soc))
+    estimator.pack.weakest.take = lambda block, soc: blocks.append((block, soc))
     charged = False
     for event in heard(WEAK):
-        if len(blocks) == 3 and estimator.weakest._block.count > 3 and not charged:
+        if len(blocks) == 3 and estimator.pack.weakest._block.count > 3 and not charged:
             charged, estimator.pack.state = True, estimator.filter._replace(soc=estimator.filter.soc + 0.2)
         estimator.handle(event)
         if len(blocks) == 6:
@@ -251,9 +252,9 @@ LIES: dict[str, Callable[[], Lie]] = {
 @pytest.mark.parametrize("name", LIES)
 def test_a_lie_from_the_start_teaches_nothing(name: str):
     found = ridden(Hidden(), 0.57, LIES[name]())
-    assert found.weakest.refused is (name != "silent")
-    assert all(abs(x.value - 1) < x.sd for x in found.weakest.learned().values())
-    assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.005)
+    assert found.pack.weakest.refused is (name != "silent")
+    assert all(abs(x.value - 1) < x.sd for x in found.pack.weakest.learned().values())
+    assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.005)
 
 
 def charged(saved: dict[str, Any]) -> None:
@@ -265,29 +266,29 @@ def charged(saved: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", LIES)
 def test_a_lie_changes_nothing_that_was_learned(name: str):
     before = at(WEAK, 0.2)
-    saved, known = before.snapshot("key"), before.weakest.learned()
+    saved, known = before.snapshot("key"), before.pack.weakest.learned()
     charged(saved)
     found = ridden(WEAK, 0.57, LIES[name](), saved)
-    for x, learned in found.weakest.learned().items():
+    for x, learned in found.pack.weakest.learned().items():
         assert abs(learned.value - known[x].value) < 1.5 * known[x].sd
-    assert found.battery.health.weakest.capacity > 0.05
+    assert found.pack.battery.health.weakest.capacity > 0.05
 
 
 def test_a_group_that_would_long_be_empty_is_none():
     """A signal 0.15 V too low from the start looks like a weak group, until the pack goes on without it."""
     deceived, later = (ridden(Hidden(), until, lambda t, v: v - 0.15) for until in (0.3, 0.12))
-    assert not deceived.weakest.refused
-    assert left(deceived, deceived.weakest.believed()) < 0.5 * left(deceived, None)
-    assert later.weakest.refused
-    assert later.weakest.believed() is None
-    assert left(later, later.battery.health.weakest) == pytest.approx(left(later, None))
+    assert not deceived.pack.weakest.refused
+    assert left(deceived, deceived.pack.weakest.group) < 0.5 * left(deceived, None)
+    assert later.pack.weakest.refused
+    assert later.pack.weakest.group is None
+    assert left(later, later.pack.battery.health.weakest) == pytest.approx(left(later, None))
 
 
 def test_a_signal_that_tells_the_truth_again_is_believed_again():
     lie = LIES["high"]()
     found = ridden(WEAK, 0.45, lambda t, v: lie(t, v) if t < 200 else v)
-    assert not found.weakest.refused
-    assert found.weakest.learned()["weak_capacity"].value < 0.98
+    assert not found.pack.weakest.refused
+    assert found.pack.weakest.learned()["weak_capacity"].value < 0.98
 
 
 # --- kept -----------------------------------------------------------------------------------------------------------
@@ -298,9 +299,9 @@ def test_what_was_learned_survives_a_restart():
     saved = json.loads(json.dumps(before.snapshot("key")))
     again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     again.restore(saved, "key", 10.0)
-    assert again.weakest.learned() == before.weakest.learned()
-    assert again.battery.health.weakest == before.battery.health.weakest
-    assert again.weakest.known == before.weakest.known
+    assert again.pack.weakest.learned() == before.pack.weakest.learned()
+    assert again.pack.battery.health.weakest == before.pack.battery.health.weakest
+    assert again.pack.weakest.known == before.pack.weakest.known
 
 
 def test_a_state_of_another_pack_has_none():
@@ -308,8 +309,8 @@ def test_a_state_of_another_pack_has_none():
     saved = at(WEAK, 0.2).snapshot("key")
     saved["learned"]["weakest"]["of"] *= 1.1
     again.restore(saved, "key", 10.0)
-    assert again.weakest.known.blocks == 0
-    assert again.battery.health.weakest is None
+    assert again.pack.weakest.known.blocks == 0
+    assert again.pack.battery.health.weakest is None
 
 
 @pytest.mark.parametrize(
@@ -332,16 +333,14 @@ def test_what_cannot_be_is_refused_whole(wrong: dict[str, Any]):
     again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     with pytest.raises(ValueError):
         again.restore(saved, "key", 10.0)
-    assert again.weakest.known.blocks == 0
+    assert again.pack.weakest.known.blocks == 0
 
 
 # --- the energy of a pack with a weak group ---------------------------------------------------------------------------
 
 
 def pack_with(weakest: WeakGroup | None) -> Battery:
-    battery = VEHICLE.pack.own()
-    battery.weaken(weakest)
-    return battery
+    return VEHICLE.pack.aged(Health(weakest=weakest))
 
 
 def test_a_pack_delivers_until_its_weakest_group_ends():
@@ -357,18 +356,12 @@ def test_a_pack_delivers_until_its_weakest_group_ends():
     assert alike.energy == pytest.approx(whole.energy, rel=2e-3)
 
 
-def test_what_is_weak_in_one_vehicle_is_not_in_another():
-    battery = VEHICLE.pack
-    battery.own().weaken(WeakGroup(0.1, 0.1, 0.1))
-    assert battery.health.weakest is None
-
-
 def test_another_pack_begins_with_no_weak_group():
     """Of packs that are told apart by their resistance."""
     saved = at(WEAK, 0.2).snapshot("key")
     saved["learned"]["resistance"] = 1.6
     charged(saved)
     found = ridden(Hidden(), 0.55, saved=saved)
-    assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
-    for x in found.weakest.learned().values():
+    assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
+    for x in found.pack.weakest.learned().values():
         assert abs(x.value - 1) < 2 * x.sd

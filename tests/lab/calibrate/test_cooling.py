@@ -288,9 +288,9 @@ def test_bursts_heat_the_cells_by_what_their_reaction_has_built_up():
         ride_run(Samples("bursts", columns), vehicle) for vehicle in (VEHICLE, without_cell_effects(VEHICLE))
     )
     effects, joules = CellEffects(VEHICLE.model, VEHICLE.pack), 0.0
-    effects.step(STOOD, 60.0 / 12, 0.5, 15.0)  # such runs are taken to begin under way
+    effects.step(VEHICLE.pack, STOOD, 60.0 / 12, 0.5, 15.0)  # such runs are taken to begin under way
     for cell in (amperes / 12).tolist():
-        effects.step(0.1, cell, 0.5, 15.0)
+        effects.step(VEHICLE.pack, 0.1, cell, 0.5, 15.0)
         joules += 168 * cell * effects.overpotential * 0.1
     found = with_it.pack_heat.sum() - without_it.pack_heat.sum()
     assert found == pytest.approx(joules, rel=0.1)
