@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import cache
@@ -66,10 +65,13 @@ def _representable(signal: Signal) -> tuple[float, float]:
     return 0, 2**signal.length - 1
 
 
-def is_not_available(signal: Signal, raw: float) -> bool:
-    """Whether a raw value is the code for not available: all ones, the least of a signed signal, or NaN."""
+def is_not_available(signal: Signal, raw: Any) -> Any:
+    """Whether a raw value, or each of an array, is the code for not available.
+
+    That is all ones, the least of a signed signal, or NaN.
+    """
     if signal.conversion.is_float:
-        return math.isnan(raw)
+        return raw != raw  # noqa: PLR0124  # as is NaN alone
     return signal.length >= 8 and raw == (-(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1)
 
 

@@ -182,9 +182,9 @@ def _protection(message: Message, options: Table) -> Protection:
         raise options.error(f"{counter!r} is the crc of {message.name}: it cannot be its counter too", "counter")
     found = signals.get(counter)
     if found and (
-        found.is_signed or found.conversion.is_float or found.multiplexer_ids is not None or found.length < 2
+        found.is_signed or found.conversion.is_float or found.multiplexer_ids is not None or not 2 <= found.length <= 32
     ):
-        said = f"{counter!r} must be an unsigned integer of 2 bits or more, in every {message.name}"
+        said = f"{counter!r} must be an unsigned integer of 2 to 32 bits, in every {message.name}"
         raise options.error(said, "counter")
     return Protection(crc or None, counter or None)
 

@@ -8,10 +8,10 @@ channel or sender, of which the codec chooses one.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
-from gz_onboard.bus.layout import first_bit, is_not_available, sae_j1850_tables
+from gz_onboard.bus.layout import crc_differences, first_bit, is_not_available
 from gz_onboard.bus.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, TICKS_PER_WINDOW, WINDOW_NS, Pipeline
@@ -37,8 +37,7 @@ Rows = NDArray[np.int64]
 """Indices of frames in their log, ascending."""
 _LONGEST_GAP_NS = AHEAD_NS
 """Without frames for longer the recording was stopped; in a shorter gap windows without frames end."""
-_WINDOWS_AT_ONCE = 1024  # that are made of the columns of one message
-_WIDEST_COUNTER = 32  # bits
+_WINDOWS_AT_ONCE = 1024  # that are made of the columns of all messages
 _WIDEST_SUM = 40  # bits of integers that can be added up as such: 8 million of them have 63
 _MOST_PLACES = 4096  # channels and identifiers: beyond this the codec itself decides which of them it remembers
 _NEVER_NS = -1 << 62
@@ -73,17 +72,19 @@ class _Decoded:
     time_ns: NDArray[np.int64]  # on the timeline
     columns: list[_RawColumn]
 
-    def windows(self, number: NDArray[np.int64]) -> Iterator[tuple[int, MessageWindow]]:
-        """Its windows and the number of each, in their order; number: of the window of each frame of the log."""
-        number = number[self.rows]
+    def windows(self, number: NDArray[np.int64], begin: int, end: int) -> Iterator[tuple[int, MessageWindow]]:
+        """The windows of its frames in the rows from `begin` to before `end` of the log, and the number of each.
+
+        number: of the window of each frame of the log.
+        """
+        part = slice(*np.searchsorted(self.rows, (begin, end)))
+        number, time_ns = number[self.rows[part]], self.time_ns[part]
         edges = _edges(number)
-        for first in range(0, len(edges) - 1, _WINDOWS_AT_ONCE):
-            ends = edges[first : first + _WINDOWS_AT_ONCE + 1]
-            part = slice(ends[0], ends[-1])
-            roles = [_role_windows(column, part, number, self.time_ns) for column in self.columns]
-            times = (self.time_ns[ends[1:] - 1] * 1e-9).tolist()
-            made = map(MessageWindow, repeat(self.group), times, np.diff(ends).tolist(), zip(*roles, strict=True))
-            yield from zip(number[ends[:-1]].tolist(), made, strict=True)
+        known = number[edges[:-1]]
+        times = (time_ns[edges[1:] - 1] * 1e-9).tolist()
+        roles = [_role_windows(column, part, number, time_ns, known) for column in self.columns]
+        made = map(MessageWindow, repeat(self.group), times, np.diff(edges).tolist(), zip(*roles, strict=True))
+        return zip(known.tolist(), made, strict=True)
 
 
 class DecodedLog:
@@ -98,16 +99,16 @@ class DecodedLog:
         self.frames, self.codec = frames, codec
         self._odd = np.zeros(len(frames), bool) if odd is None else odd
         timed = np.flatnonzero(~self._odd)
-        self._kept, self._passed_ns = np.zeros(len(frames), bool), np.zeros(len(frames), np.int64)
-        self._kept[timed], self._passed_ns[timed] = on_timeline(frames.time_ns[timed], codec)
-        kept = np.flatnonzero(self._kept)
+        is_kept, self._passed_ns = np.zeros(len(frames), bool), np.zeros(len(frames), np.int64)
+        is_kept[timed], self._passed_ns[timed] = on_timeline(frames.time_ns[timed], codec)
+        kept = np.flatnonzero(is_kept)
         following = np.searchsorted(kept, np.arange(len(frames))).clip(max=max(len(kept) - 1, 0))
         latest = np.maximum.accumulate(self._passed_ns[kept])
         self._now_ns = latest[following]  # when each frame came: one of a wrong time with the next of a good one
         codec.faults.clear()  # of odd times, counted here with their frames
-        self._events: list[tuple[dict[Any, int], Any, Rows, NDArray[np.int64] | None]] = []
+        self._events: list[tuple[dict[Any, int], Any, Rows, NDArray[np.int64]]] = []
         self._count(vars(codec), "received", np.arange(len(frames)))
-        self._count(codec.faults, ("", TIME), np.flatnonzero(~self._kept))
+        self._count(codec.faults, ("", TIME), np.flatnonzero(~is_kept))
         self._good: dict[str, Rows] = {}  # by message
         self._decoded: list[_Decoded] = []
         self._one_by_one: Rows = np.zeros(0, np.int64)
@@ -124,8 +125,8 @@ class DecodedLog:
                 if real.any():
                     found[source.role] = time[real], column.raw[real].astype(float) * source.factor + source.offset
         found |= self._samples_one_by_one()
-        for counts, key, rows, numbers in self._events:
-            counts[key] = counts.get(key, 0) + (len(rows) if numbers is None else int(numbers.sum()))
+        for counts, key, _, numbers in self._events:
+            counts[key] = counts.get(key, 0) + int(numbers.sum())
         self.see_latest(len(self.frames))
         return {role: found[role] for group in self.codec.groups for role in group.roles if role in found}
 
@@ -135,40 +136,31 @@ class DecodedLog:
         They end on a grid that begins with the first frame. In a gap between frames windows without any end, in a
         longer one the recording was stopped.
         """
-        if not len(self.frames):
-            return
         now = self._now_ns
         number = (now - TICK_NS) // WINDOW_NS + 1  # of the window of each frame
-        messages = [message.windows(number) for message in self._decoded]
-        waiting = [next(windows, None) for windows in messages]
-        events = self._events_of(number)
-        event = next(events, None)
-        begin, follows = 0, False
-        edges = _edges(number)
-        for end in edges[1:].tolist():
-            before, last = int(number[begin]), end == len(now)
-            after = before if last else int(number[end])
-            paused = not last and now[end] - now[end - 1] > _LONGEST_GAP_NS
-            while event and event[0] <= before:
-                _, counts, key, count = event
+        edges = _edges(number).tolist()
+        events, decoded, follows = self._events_of(number), dict[int, list[MessageWindow]](), False
+        for place, (begin, end) in enumerate(pairwise(edges)):
+            if place % _WINDOWS_AT_ONCE == 0:
+                decoded = self._windows(number, begin, edges[place : place + _WINDOWS_AT_ONCE + 1][-1])
+            window = int(number[begin])
+            for counts, key, count in events[window]:
                 counts[key] = counts.get(key, 0) + count
-                event = next(events, None)
             windows = []
             if len(self._one_by_one):
                 self._take(self._one_by_one[slice(*np.searchsorted(self._one_by_one, (begin, end)))])
                 windows = self.codec.windows()
                 self.codec.begin_at(self._origin_ns)
-            if last:  # a window that has not ended
+            if end == len(now):  # a window that has not ended
                 break
-            for i, window in enumerate(waiting):
-                if window and window[0] == before:
-                    windows.append(window[1])
-                    waiting[i] = next(messages[i], None)
+            windows += decoded.get(window, [])
             clock_ns = int(self.frames.time_ns[end - 1] - self._passed_ns[end - 1])
-            for ended in range(before, before + 1 if paused else after):
+            paused = now[end] - now[end - 1] > _LONGEST_GAP_NS
+            rows = slice(begin, end)
+            for ended in range(window, window + 1 if paused else int(number[end])):
                 end_ns = TICK_NS + ended * WINDOW_NS
-                yield LogWindow(end_ns, end_ns + clock_ns, follows, slice(begin, end), windows)
-                begin, windows, follows = end, [], True
+                yield LogWindow(end_ns, end_ns + clock_ns, follows, rows, windows)
+                rows, windows, follows = slice(end, end), [], True
             follows = not paused
         self.see_latest(len(now))
 
@@ -189,20 +181,25 @@ class DecodedLog:
     def _count(self, counts: dict[Any, int], key: Any, rows: Rows, numbers: NDArray[np.int64] | None = None) -> None:
         """Have `counts[key]` count the frames in these rows, or these numbers at them."""
         if len(rows):
-            self._events.append((counts, key, rows, numbers))
+            self._events.append((counts, key, rows, np.ones(len(rows), np.int64) if numbers is None else numbers))
 
-    def _events_of(self, number: NDArray[np.int64]) -> Iterator[tuple[int, dict[Any, int], Any, int]]:
-        """(number of the window, counts, key, how many more) for all that is counted, in the order of the windows."""
-        parts = []
-        for i, (_, _, rows, numbers) in enumerate(self._events):
-            windows = number[rows]
-            edges = _edges(windows)
-            many = np.diff(edges) if numbers is None else np.add.reduceat(numbers, edges[:-1])
-            parts.append((windows[edges[:-1]], np.full(len(many), i), many))
-        windows, which, many = (np.concatenate(part) for part in zip(*parts, strict=True))
-        for row in np.argsort(windows, kind="stable").tolist():
-            counts, key, _, _ = self._events[which[row]]
-            yield int(windows[row]), counts, key, int(many[row])
+    def _events_of(self, number: NDArray[np.int64]) -> dict[int, list[tuple[dict[Any, int], Any, int]]]:
+        """(counts, key, how many more) for all that is counted, by the number of the window."""
+        found = defaultdict[int, list[tuple[dict[Any, int], Any, int]]](list)
+        for counts, key, rows, numbers in self._events:
+            begins = _edges(number[rows])[:-1]
+            many = np.add.reduceat(numbers, begins)
+            for window, count in zip(number[rows[begins]].tolist(), many.tolist(), strict=True):
+                found[window].append((counts, key, count))
+        return found
+
+    def _windows(self, number: NDArray[np.int64], begin: int, end: int) -> dict[int, list[MessageWindow]]:
+        """The windows of all messages decoded by columns, by the number of the window; see `_Decoded.windows`."""
+        found = defaultdict[int, list[MessageWindow]](list)
+        for message in self._decoded:
+            for place, window in message.windows(number, begin, end):
+                found[place].append(window)
+        return found
 
     # --- decoding ---------------------------------------------------------------------------------------------
 
@@ -215,17 +212,17 @@ class DecodedLog:
         asked = {*codec.asked, *(request.response for request in mapping.requests)}
         one_by_one = []
         for (channel, identifier, those), origin in zip(places, origins, strict=True):
-            several = origin is not None and heard[origin.message.name] > 1
+            decoder = codec.decoders[origin.message.name] if origin else None
+            several = decoder is not None and heard[decoder.name] > 1
             if len(places) > _MOST_PLACES or identifier in asked or several:
                 one_by_one.append(those)
                 continue
             codec.inbox(channel, identifier)
-            decoder = codec.decoders[origin.message.name] if origin else None
             if identifier & ERR_FLAG:
                 self._count(vars(codec), "error_frames", those)
             elif decoder is None:
                 self._count(codec.unknown, identifier, those)
-            elif decoder.is_sole and _has_columns(decoder):
+            elif decoder.is_sole:
                 self._decode_message(decoder, those)
             else:
                 one_by_one.append(those)
@@ -240,7 +237,7 @@ class DecodedLog:
         rows = rows[right]
         data = self.frames.data[rows, :n]
         if protection.crc and len(rows):
-            right = _has_right_crc(data)
+            right = np.frombuffer(crc_differences(data.tobytes(), n), np.uint8) == 0
             self._count(faults, (message.name, CRC), rows[~right])
             rows, data = rows[right], data[right]
         if protection.counter:
@@ -257,12 +254,9 @@ class DecodedLog:
         columns: list[_RawColumn] = []
         seen: Mask = np.zeros(len(rows), bool)  # with a signal of ours, on a page of a multiplexer
         for source, signal, limits in zip(mapped.sources, mapped.signals, mapped.limits, strict=True):
-            raw = _raw(signal, data)
-            present: Mask = np.ones(len(data), bool)
-            if pager := _pager(message, signal):
-                present = np.isin(_raw(pager, data), list(signal.multiplexer_ids or ()))
+            raw, present = _raw(signal, data), _is_present(message, signal, data)
             real = present & _within(raw, signal, limits)
-            absent = present & ~real & _is_code(raw, signal, mapped.not_available)
+            absent = present & ~real & (mapped.not_available and is_not_available(signal, raw))
             place = f"{source.message}.{source.signal}"
             self._count(faults, (place, NOT_AVAILABLE), rows[absent])
             self._count(faults, (place, RANGE), rows[present & ~real & ~absent])
@@ -335,21 +329,21 @@ def _log_frames(pipeline: Pipeline, decoded: DecodedLog, step: LogWindow) -> Non
 
 
 def _edges(number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The rows where another number begins, from 0 to the length of `number`."""
-    edges: NDArray[np.int64] = np.concatenate(([0], np.flatnonzero(np.diff(number)) + 1, [len(number)]))
+    """The rows where another number begins, and the length of `number`."""
+    edges: NDArray[np.int64] = np.append(np.flatnonzero(np.diff(number, prepend=number[:1] - 1)), len(number))
     return edges
 
 
 def _role_windows(
-    column: _RawColumn, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64]
+    column: _RawColumn, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64], known: NDArray[np.int64]
 ) -> list[RoleWindow | None]:
-    """What a signal showed in each window of a part of its message's frames; number: of the window of each frame."""
-    source, raw, real, number, time_ns = column.source, column.raw[part], column.real[part], number[part], time_ns[part]
-    known = number[_edges(number)[:-1]]
+    """What a signal showed in each of the windows `known`; None if nothing.
+
+    part: of its message's frames; number, time_ns: of the window of each of them, and when it came.
+    """
+    source, raw, real = column.source, column.raw[part], column.real[part]
     if not real.all():
         raw, number, time_ns = raw[real], number[real], time_ns[real]
-    if not len(raw):
-        return [None] * len(known)
     edges = _edges(number)
     begins, last, count = edges[:-1], edges[1:] - 1, np.diff(edges)
     mean = np.add.reduceat(raw, begins) / count
@@ -357,22 +351,17 @@ def _role_windows(
     if source.role in SQUARED:
         square = source.factor * source.factor * np.add.reduceat(raw.astype(float) ** 2, begins) / count
         squares = (square + source.offset * (2 * source.factor * mean + source.offset)).tolist()
-    made: list[RoleWindow | None] = list(
-        map(
-            RoleWindow,
-            (time_ns[last] * 1e-9).tolist(),
-            (raw[last] * source.factor + source.offset).tolist(),
-            count.tolist(),
-            (mean * source.factor + source.offset).tolist(),
-            squares,
-        )
+    made = map(
+        RoleWindow,
+        (time_ns[last] * 1e-9).tolist(),
+        (raw[last] * source.factor + source.offset).tolist(),
+        count.tolist(),
+        (mean * source.factor + source.offset).tolist(),
+        squares,
     )
-    if len(made) == len(known):
-        return made
-    windows: list[RoleWindow | None] = [None] * len(known)
-    for place, window in zip(np.searchsorted(known, number[begins]).tolist(), made, strict=True):
-        windows[place] = window
-    return windows
+    if len(begins) == len(known):
+        return list(made)
+    return [next(made) if shown else None for shown in np.isin(known, number[begins]).tolist()]
 
 
 def _by_place(frames: FrameColumns, rows: Rows) -> list[tuple[int, int, Rows]]:
@@ -387,29 +376,14 @@ def _by_place(frames: FrameColumns, rows: Rows) -> list[tuple[int, int, Rows]]:
     return sorted(found, key=lambda place: int(place[2][0]))
 
 
-def _has_columns(decoder: MessageDecoder) -> bool:
-    """Whether columns can follow a message: not one with a wide counter, or with pages within pages."""
-    message, counter = decoder.message, decoder.protection.counter
-    pagers = [_pager(message, signal) for signal in decoder.signals]
-    nested = any(pager is not None and pager.multiplexer_ids is not None for pager in pagers)
-    return not nested and not (counter and message.get_signal_by_name(counter).length > _WIDEST_COUNTER)
-
-
-def _pager(message: Message, signal: Signal) -> Signal | None:
-    """The multiplexer of a signal; None if every frame has the signal."""
-    if signal.multiplexer_ids is None or not signal.multiplexer_signal:
-        return None
-    return message.get_signal_by_name(signal.multiplexer_signal)
-
-
-def _has_right_crc(data: NDArray[np.uint8]) -> Mask:
-    """Whether the last byte of each row is the CRC of the others."""
-    constant, tables = sae_j1850_tables(data.shape[1] - 1)
-    crc = np.full(len(data), constant, np.uint8)
-    for column, table in zip(data.T, tables, strict=False):
-        crc ^= np.frombuffer(table, np.uint8)[column]
-    right: Mask = crc == data[:, -1]
-    return right
+def _is_present(message: Message, signal: Signal, data: NDArray[np.uint8]) -> Mask:
+    """Whether each row has the signal: those of the pages of a multiplexer that it is on."""
+    if signal.multiplexer_ids is None:
+        return np.ones(len(data), bool)
+    if not signal.multiplexer_signal:
+        return np.zeros(len(data), bool)
+    pager = message.get_signal_by_name(signal.multiplexer_signal)
+    return _is_present(message, pager, data) & np.isin(_raw(pager, data), list(signal.multiplexer_ids))
 
 
 def _follow_counter(
@@ -456,21 +430,6 @@ def _within(raw: NDArray[Any], signal: Signal, limits: tuple[float, float]) -> M
     """Whether raw values are within their limits; of integers exactly, which floats above 2^53 are not."""
     low, high = limits
     if not signal.conversion.is_float:
-        least, most = np.iinfo(raw.dtype).min, np.iinfo(raw.dtype).max
-        if low > most or high < least:
-            return np.zeros(len(raw), bool)
-        low, high = math.ceil(max(low, least)), math.floor(min(high, most))
+        low, high = math.ceil(low), math.floor(high)
     within: Mask = (raw >= low) & (raw <= high)
     return within
-
-
-def _is_code(raw: NDArray[Any], signal: Signal, not_available: bool) -> Mask:
-    """Whether raw values are the code for not available."""
-    if not not_available:
-        return np.zeros(len(raw), bool)
-    if signal.conversion.is_float:
-        is_nan: Mask = np.isnan(raw)
-        return is_nan
-    code = -(1 << signal.length - 1) if signal.is_signed else (1 << signal.length) - 1
-    is_code: Mask = (raw == code) & is_not_available(signal, code)
-    return is_code
