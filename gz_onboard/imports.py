@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
-_PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # whose names differ from those of their modules
+EXTRAS = {
+    "asammdf": ("asammdf", "mf4"),
+    "filterpy": ("filterpy", "lab"),
+    "foxglove": ("foxglove-sdk", "foxglove"),
+    "matplotlib": ("matplotlib", "lab"),
+    "msgpack": ("msgpack", "udp"),
+    "paho": ("paho-mqtt", "mqtt"),
+    "pyarrow": ("pyarrow", "lab"),
+    "scipy": ("scipy", "lab"),
+}  # by module: the package that has it, and the extra of ours that installs it
 
 
 def require(module: str, wanted: bool = True) -> None:
@@ -21,19 +29,8 @@ def require(module: str, wanted: bool = True) -> None:
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
     """Describe the extra of this package to install for a missing module; None if no extra has it."""
-    from importlib.metadata import PackageNotFoundError, requires
-
-    module = (error.name or "").partition(".")[0]
-    package = _PACKAGES.get(module, module)
-    try:
-        needed = requires("gz-onboard") or []
-    except PackageNotFoundError:
-        return None
-    for requirement in needed:
-        found = re.fullmatch(r"([\w-]+).*;.*\bextra == ['\"](\w+)['\"].*", requirement)
-        if found and found[1].replace("-", "_").lower() == package.replace("-", "_").lower():
-            return f"needs {package}, which is not installed: pip install 'gz-onboard[{found[2]}]'"
-    return None
+    found = EXTRAS.get((error.name or "").partition(".")[0])
+    return found and f"needs {found[0]}, which is not installed: pip install 'gz-onboard[{found[1]}]'"
 
 
 class _Hollow(ModuleType):

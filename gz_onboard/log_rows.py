@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf, isfinite
+from math import isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
@@ -170,26 +170,17 @@ def location_row(time_ns: int, frame: str, latitude: float, longitude: float, al
     return row if altitude is None else row | {"altitude": round(altitude, 2)}
 
 
-class Positions:
-    """The positions among a vehicle's signals, each once, as rows of `LOCATION_TOPIC`."""
+def position_row(signals: Signals, now: float, time_ns: int) -> tuple[int, dict[str, Any]] | None:
+    """When the vehicle's position was seen [ns], and its row; None if it is not known, or there is no fix.
 
-    def __init__(self) -> None:
-        self._located = -inf  # s, of the last position given
-
-    def new(self, signals: Signals, now: float, time_ns: int) -> tuple[int, dict[str, Any]] | None:
-        """When a position was seen [ns], and its row; None if there is none that was not given before, or no fix.
-
-        now: [s, on the timeline of the signals], the same time as `time_ns` [ns since 1970].
-        """
-        latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
-        if latitude is None or longitude is None or signals.longitude.time <= self._located:
-            return None
-        self._located = signals.longitude.time
-        if signals.fix_below(now, FIX_2D):
-            return None
-        altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
-        seen_ns = time_ns - round((now - self._located) * 1e9)
-        return seen_ns, location_row(seen_ns, "gps", latitude, longitude, altitude)
+    now: [s, on the timeline of the signals], the same time as `time_ns` [ns since 1970].
+    """
+    latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
+    if latitude is None or longitude is None or signals.fix_below(now, FIX_2D):
+        return None
+    altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
+    seen_ns = time_ns - round((now - signals.longitude.time) * 1e9)
+    return seen_ns, location_row(seen_ns, "gps", latitude, longitude, altitude)
 
 
 def estimate_schema() -> dict[str, Any]:

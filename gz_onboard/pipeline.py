@@ -29,12 +29,12 @@ from gz_onboard.log_rows import (
     STATUS_TOPIC,
     WHY_TOPIC,
     Log,
-    Positions,
     declare,
     estimate_row,
     explanation_row,
     learned_row,
     location_row,
+    position_row,
     reason_names,
     ride_row,
 )
@@ -106,7 +106,6 @@ class Pipeline:
         self._range_due = False  # frames of a second that has ended
         self._dropped_before = self._lost_before = 0
         self._recent = Reason(0)
-        self._positions = Positions()
         if log:
             answers = [request.message for request in vehicle.mapping.requests]
             declare(log, [*self.codec.mapping.database.messages, *answers] if log_signals else ())
@@ -216,12 +215,13 @@ class Pipeline:
 
     def _sample_signals(self, log: Log, now: float, time_ns: int) -> None:
         """Log the latest signals of each message, at the time of their frame, and the position."""
+        logged_ns = time_ns - WINDOWS_PER_RANGE * WINDOW_NS  # what was seen until then was logged before
         for name, (seen_ns, _, data, _) in self.codec.latest.items():
-            if time_ns - seen_ns < WINDOWS_PER_RANGE * WINDOW_NS:  # not again what was logged before
+            if seen_ns > logged_ns:
                 log.sample(f"/can/{name}", time_ns, self.codec.values(name, data), seen_ns)
-        if found := self._positions.new(self.estimator.signals, now, time_ns):
-            seen_ns, row = found
-            log.sample(LOCATION_TOPIC, time_ns, row, seen_ns)
+        position = position_row(self.estimator.signals, now, time_ns)
+        if position and position[0] > logged_ns:
+            log.sample(LOCATION_TOPIC, time_ns, position[1], position[0])
 
     @property
     def foreign(self) -> dict[str, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Collection, Mapping
 from itertools import pairwise, takewhile
 from pathlib import Path
@@ -58,11 +59,9 @@ class Table:
         inside = ".".join(part[:LONGEST_NAME] for part in path if not part.isdigit())
         return InputError(f"{place}: {inside}: {message}" if inside else f"{place}: {message}")
 
-    def only(self, known: Collection[str], removed: Mapping[str, str] | None = None) -> None:
-        """InputError for a key that is not in `known`. removed: reasons for keys of earlier versions."""
+    def only(self, known: Collection[str]) -> None:
+        """InputError for a key that is not in `known`."""
         for key in self.values:
-            if removed and key in removed:
-                raise self.error(f"was removed: {removed[key]}", key)
             if key not in known:
                 there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
                 raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
@@ -165,16 +164,15 @@ def _line_of(text: str, path: tuple[str, ...]) -> int | None:
     """The line of the first header or key that has most of `path` in its own; None if none begins alike."""
     found, most = None, 0
     table: tuple[str, ...] = ()
-    counts: dict[tuple[str, ...], int] = {}  # of the tables of an array so far
+    counts: Counter[str] = Counter()  # of the tables of each array so far, which are at the top
     for number, line in enumerate(text.split("\n"), start=1):
         if header := _HEADER.match(line):
-            table = here = _parts(header[2], counts)
-            if header[1] == "[[":
-                name = here[:-1] if here[-1].isdigit() else here
-                counts[name] = counts.get(name, -1) + 1
-                table = here = (*name, str(counts[name]))
+            array, *inner = _parts(header[2])
+            counts[array] += header[1] == "[["
+            index = [str(counts[array] - 1)] if counts[array] else []
+            here = table = (array, *index, *inner)
         elif key := _KEY.match(line):
-            here = table + _parts(key[1], {})
+            here = table + _parts(key[1])
         else:
             continue
         alike = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(here, path, strict=False)))
@@ -183,14 +181,8 @@ def _line_of(text: str, path: tuple[str, ...]) -> int | None:
     return found
 
 
-def _parts(key: str, counts: Mapping[tuple[str, ...], int]) -> tuple[str, ...]:
-    """The parts of a dotted key, with the index of the last table so far after the name of an array of tables."""
-    path: tuple[str, ...] = ()
-    for part in key.split("."):
-        path = (*path, part.strip(" \t\"'"))
-        if path in counts:
-            path = (*path, str(counts[path]))
-    return path
+def _parts(key: str) -> tuple[str, ...]:
+    return tuple(part.strip(" \t\"'") for part in key.split("."))
 
 
 def is_file(path: Path) -> bool:

@@ -28,9 +28,6 @@ KEYS = (
     "correlation battery forecast controller healthy"
 )
 
-REMOVED = {"poll": "requests are not sent, only answers to another tester are read"}
-"""Keys of earlier versions, and why they are gone."""
-
 
 @dataclass(frozen=True)
 class Vehicle:
@@ -153,15 +150,18 @@ def read_vehicle(
     of several vehicles with this file.
     """
     table = Table.read(find_vehicle(name))
-    table.only(KEYS.split(), removed=REMOVED)
+    table.only(KEYS.split())
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_effects(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     model, derating = Model(effects, parameters), read_derating(table)
     riding = read_riding(table, model, derating.top_spin)
+    own_name = table.text("name")  # becomes part of file names: no path, nothing that a shell would split
+    if not re.fullmatch(NAME, own_name):
+        raise table.error(f"must be {NAME_TEXT}, is {shown(own_name)}", "name")
     vehicle = Vehicle(
-        name=_name(table),
+        name=own_name,
         file=table.file,
         mapping=read_mapping(table),
         parameters=parameters,
@@ -201,14 +201,6 @@ def _range_identifier(table: Table) -> int | None:
             "range_identifier",
         )
     return first
-
-
-def _name(table: Table) -> str:
-    """Read the name, which becomes part of file names: no path, nothing that a shell would split."""
-    name = table.text("name")
-    if not re.fullmatch(NAME, name):
-        raise table.error(f"must be {NAME_TEXT}, is {shown(name)}", "name")
-    return name
 
 
 def _healthy(table: Table) -> Path | None:

@@ -146,7 +146,7 @@ def test_the_answer_has_units():
     on |= {"arrival_soc": 0.3249, "arrival_soc_p10": 0.2811, "arrival_soc_p90": 0.3702, "range_m": 24312.9}
     assert route_text(on).splitlines() == [
         "route  home",
-        "  on it, 3.2 km ridden, 9.8 km and 305 Wh to its end",
+        "  on it, 3.2 km ridden, 9.8 km to its end for 305 Wh",
         "  32 % of charge at its end (28 to 37 %, 80 % interval)",
         "range  24.3 km",
     ]

@@ -11,6 +11,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from gz_onboard.imports import EXTRAS
+
 ROOT = Path(__file__).resolve().parents[1]
 LOCK, DOCS_LOCK, BOARD_LOCK, LAB_LOCK = (
     (ROOT / ".ci" / f"requirements{name}.txt").read_text(encoding="utf-8") for name in ("", "-docs", "-board", "-lab")
@@ -75,3 +77,9 @@ def check(needed: list[str], lock: dict[str, str]) -> None:
     for text in needed:
         requirement = Requirement(text)
         assert requirement.specifier.contains(lock[canonicalize_name(requirement.name)]), text
+
+
+def test_a_missing_module_of_each_extra_is_explained():
+    extras = PROJECT["project"]["optional-dependencies"]
+    wanted = {(Requirement(one).name, extra) for extra in extras.keys() - {"dev", "docs"} for one in extras[extra]}
+    assert set(EXTRAS.values()) == wanted

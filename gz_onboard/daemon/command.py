@@ -16,7 +16,7 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.daemon.control import SOCKET
-from gz_onboard.daemon.loop import Daemon, foreign_text, state_text
+from gz_onboard.daemon.loop import Daemon, foreign_text, status_text
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
 from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.options import CHANNEL, add_shared, number
@@ -174,7 +174,7 @@ def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | 
 
 
 def summary(pipeline: Pipeline) -> list[str]:
-    """Describe the received frames, the last known numbers and the last state, as they were sent."""
+    """Describe the received frames, the last estimate that had a range, and the last of all."""
     last, known, counts = pipeline.last, pipeline.last_known, pipeline.counts()
     lines = [
         f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
@@ -182,14 +182,8 @@ def summary(pipeline: Pipeline) -> list[str]:
     ]
     if pipeline.foreign:
         lines.append(foreign_text(pipeline))
-    if last is None:
-        return lines
-    earlier = ""
-    if known and known.soc is not None and known.soc_sd is not None:
-        _, *numbers = pipeline.publisher.reported(known)
-        remaining, p10, p90 = ("–" if value is None else f"{value / 1000:.1f}" for value in numbers)
-        soc = f"state of charge {100 * known.soc:.1f} % ± {100 * known.soc_sd:.1f} %"
-        lines += [f"{soc}, ridden {last.distance / 1000:.2f} km", f"range {remaining} km ({p10} to {p90})"]
-        earlier = f"; the figures above are from {last.time - known.time:.1f} s earlier" if known is not last else ""
-    state = pipeline.publisher.reported(last)[0]
-    return [*lines, f"state at the end {state_text(state, last.reasons)}{earlier}"]
+    if last and known and known is not last:
+        lines.append(f"{last.time - known.time:.1f} s before the end {status_text(pipeline, known)}")
+    if last:
+        lines.append(f"at the end {status_text(pipeline, last)}")
+    return lines

@@ -19,6 +19,7 @@ from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 from gz_onboard.constants import WH
 from gz_onboard.errors import OK, InputError, nearest, shown
@@ -210,34 +211,29 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def route_text(answer: Mapping[str, object]) -> str:
+def route_text(answer: Mapping[str, Any]) -> str:
     """Describe the daemon's answer, for a terminal."""
+    known = {key: value for key, value in answer.items() if value is not None}
 
-    def number(key: str, factor: float, form: str) -> str:
-        value = answer.get(key)
-        return format(factor * value, form) if isinstance(value, int | float) else ""
+    def said(text: str, *keys: str, factor: float = 1.0) -> str:
+        """`text` with the numbers in its braces; nothing unless all of them are known."""
+        return text.format(*(factor * known[key] for key in keys)) if known.keys() >= {*keys} else ""
 
-    name, length = answer.get("route"), number("length_m", 1e-3, ".2f")
-    lines = [f"route  {name or 'none'}{f', {length} km' if length else ''}"]
-    if name and "state" in answer:
-        line = f"  {STATES.get(str(answer['state']), 'not yet looked for')}"
-        if ridden := number("along_m", 1e-3, ".1f"):
-            line += f", {ridden} km ridden"
-        if left := number("left_m", 1e-3, ".1f"):
-            energy = number("energy_j", 1 / WH, ".0f")
-            line += f", {left} km{f' and {energy} Wh' if energy else ''} to its end"
-        lines.append(line)
-        soc, low, high = (number(f"arrival_soc{part}", 100, ".0f") for part in ("", "_p10", "_p90"))
-        latitude, longitude = (number(f"battery_ends_{axis}", 1, ".5f") for axis in ("latitude", "longitude"))
-        if after := number("battery_ends_after_m", 1e-3, ".1f"):
-            lines.append(f"  battery empty in {after} km{f', at {latitude}°, {longitude}°' if latitude else ''}")
-        elif soc:
-            lines.append(f"  {soc} % of charge at its end{f' ({low} to {high} %, 80 % interval)' if low else ''}")
-    if remaining := number("range_m", 1e-3, ".1f"):
-        lines.append(f"range  {remaining} km")
-    if answer.get("grade_known") is False:
+    lines = [f"route  {known.get('route', 'none')}" + said(", {:.2f} km", "length_m", factor=1e-3)]
+    if "route" in known and "state" in known:
+        line = f"  {STATES.get(known['state'], 'not yet looked for')}"
+        line += said(", {:.1f} km ridden", "along_m", factor=1e-3)
+        line += said(", {:.1f} km to its end", "left_m", factor=1e-3)
+        lines.append(line + said(" for {:.0f} Wh", "energy_j", factor=1 / WH))
+        ends = said("  battery empty in {:.1f} km", "battery_ends_after_m", factor=1e-3)
+        where = said(", at {:.5f}°, {:.5f}°", "battery_ends_latitude", "battery_ends_longitude")
+        soc = said("  {:.0f} % of charge at its end", "arrival_soc", factor=100)
+        between = said(" ({:.0f} to {:.0f} %, 80 % interval)", "arrival_soc_p10", "arrival_soc_p90", factor=100)
+        lines.append(ends + where if ends else soc + between)
+    lines.append(said("range  {:.1f} km", "range_m", factor=1e-3))
+    if known.get("grade_known") is False:
         lines.append("without altitudes hills are not counted")
-    return "\n".join(lines)
+    return "\n".join(filter(None, lines))
 
 
 def ask(path: Path, request: dict[str, object]) -> dict[str, object]:

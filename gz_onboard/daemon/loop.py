@@ -22,7 +22,7 @@ from gz_onboard.background import Background
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
 from gz_onboard.daemon.control import Control
-from gz_onboard.events import Frame, Reason, State
+from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.log_rows import reason_names
 from gz_onboard.notify import notify, watchdog_interval
 from gz_onboard.pipeline import Pipeline
@@ -72,7 +72,8 @@ class Daemon:
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         self._reported_at = 0.0
         self._problems: list[str] = []  # a second ago, as the next two
-        self._state = self._status = ""
+        self._state: tuple[State, Reason] | None = None
+        self._status = ""
 
     def stop(self, *_: object) -> None:
         """End after the present tick."""
@@ -201,16 +202,13 @@ class Daemon:
         self._problems = problems
         if last is None:
             return
-        state, remaining, _, _ = pipeline.publisher.reported(last)
-        status = text = state_text(state, last.reasons)
-        if remaining is not None and last.soc is not None:
-            status = f"{remaining / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
-        if text != self._state:
+        state, status = (last.state, last.reasons), status_text(pipeline, last)
+        if state != self._state:
             counts = pipeline.counts()
-            log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
+            log.info("%s; dropped %d, lost %d, unknown %d", status, counts.dropped, counts.lost, counts.unknown)
         if status != self._status:
             notify(STATUS=status)
-        self._state, self._status = text, status
+        self._state, self._status = state, status
 
 
 class StateKeeper:
@@ -317,6 +315,10 @@ def _wall_offset() -> int:
     return wall - before
 
 
-def state_text(state: State, reasons: Reason) -> str:
-    """Describe a state with its reasons on one line."""
-    return f"{state.name.lower()}: {' '.join(reason_names(reasons)) or 'all inputs there'}"
+def status_text(pipeline: Pipeline, estimate: Estimate) -> str:
+    """Describe an estimate, as it was sent, on one line."""
+    state, remaining, _, _ = pipeline.publisher.reported(estimate)
+    text = f"{state.name.lower()}: {' '.join(reason_names(estimate.reasons)) or 'all inputs there'}"
+    if remaining is None or estimate.soc is None:
+        return text
+    return f"range {remaining / 1000:.1f} km, charge {100 * estimate.soc:.0f} %, {text}"

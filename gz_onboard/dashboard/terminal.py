@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import sys
@@ -11,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from math import inf
 from typing import TextIO
 
 from gz_onboard.bus.publisher import reason_signal
@@ -49,7 +49,7 @@ def show(pictures: Iterator[Picture], comments: Mapping[str, str], once: bool) -
         and os.environ.get("TERM", "dumb") != "dumb"
     )
     colour, on_screen = terminal and "NO_COLOR" not in os.environ, terminal and not once
-    picture, drawn = None, -math.inf
+    picture, drawn = None, -inf
     with _other_screen(out) if on_screen else nullcontext():
         for picture in pictures:
             now = time.monotonic()
@@ -108,7 +108,6 @@ def screen(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Li
         ("gz-onboard", source, _DIM),
         _EMPTY,
         of_message("RANGE_Estimate", "Range", f"{km}     80 %: {p10} to {p90}", f"{_BOLD};{colour}"),
-        *(of_message("RANGE_Estimate", "", text, colour) for text in _band(ranges, width - INDENT)),
         _EMPTY,
         of_message("RANGE_Status", "State of charge", charged, f"{_BOLD};{_RED}" if red else _BOLD),
         of_message("RANGE_Energy", "Energy left", _text(battery["energy_left_wh"], ".0f", "Wh")),
@@ -165,20 +164,3 @@ def _text(value: float | None, form: str, unit: str) -> str:
 
 def _list(label: str, texts: Sequence[str], codes: str) -> list[Line]:
     return [("" if i else label, text, codes) for i, text in enumerate(texts)]
-
-
-def _band(ranges: Mapping[str, float | None], cells: int) -> tuple[str, str]:
-    """A bar from P10 to P90 with the range as a dot, and below it the scale from 0 km."""
-    p10, km, p90 = ranges["p10_km"], ranges["km"], ranges["p90_km"]
-    if p10 is None or km is None or p90 is None:
-        return "─" * cells, ""
-    top = scale_end(p90)
-    first, dot, last = (min(round(value / top * (cells - 1)), cells - 1) for value in (p10, km, p90))
-    bar = "─" * first + "━" * (dot - first) + "●" + "━" * (last - dot) + "─" * (cells - 1 - last)
-    return bar, "0" + f"{top:g} km".rjust(cells - 1)
-
-
-def scale_end(value: float) -> float:
-    """The next round number from `value` on, at least 1."""
-    size = 10.0 ** math.floor(math.log10(max(value, 1.0)))
-    return next(step * size for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * size >= value)

@@ -140,11 +140,6 @@ def test_a_mistake_is_named_with_its_place(tmp_path, old, new, key, occurrence, 
     assert abs(int(place[1]) - line(key, occurrence)) <= new.count("\n"), (lines[int(place[1]) - 1], message)
 
 
-def test_a_vehicle_that_was_to_be_asked_is_refused_with_the_reason(tmp_path):
-    message = refusal(changed(tmp_path, ("[roles]", "[poll]\nbus_share = 0.01\n\n[roles]")))
-    assert f"kona.toml:{line('[roles]')}: poll: was removed: requests are not sent" in message
-
-
 def test_requests_under_one_key_and_no_requests(tmp_path):
     begin, end = TEXT.index("[[request]]"), TEXT.index("[roles]")
     assert "must be tables under headers [[request]]" in refusal(changed(tmp_path, (TEXT[begin:end], "request = 3\n")))

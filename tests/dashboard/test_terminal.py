@@ -122,13 +122,6 @@ def test_a_scooter_that_is_not_on_is_waited_for():
     assert not re.search("no IMU|Because|invalid", text)
 
 
-def test_the_bar_stands_where_the_numbers_are():
-    bar = next(line for line in drawn(seen(), 100.0, 78).splitlines() if "●" in line)
-    assert len(bar) == 78
-    for mark, km in (bar.index("━"), 26.54), (bar.index("●"), 34.21), (bar.rindex("━"), 44.34):
-        assert (mark - 20) / 57 * 50 == pytest.approx(km, abs=1.1)
-
-
 def test_an_old_number_is_never_shown_as_if_fresh():
     view = seen(now=100.0)
     assert "62.4" in drawn(view, 100.9)
@@ -315,12 +308,6 @@ def test_nothing_on_the_bus_breaks_it(frames, checksum):
         for width in 10, 80, 300:
             for line in drawn(view, now, width).splitlines():
                 assert len(line) <= width
-
-
-@given(st.floats(0, 660))
-def test_the_scale_is_a_round_number_just_beyond(value):
-    end = terminal.scale_end(value)
-    assert value <= end <= max(2 * value, 1)
 
 
 @given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(1, 120))
