@@ -112,7 +112,7 @@ class Pipeline:
 
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
         """Process `frames`, ordered by time, up to `until_ns`; return the frames to send."""
-        if self._next_ns is None or (frames and not self.codec.started):
+        if self._next_ns is None or (frames and self.codec.origin_ns is None):
             # On a silent bus we say that we are there and have nothing; the grid begins with the first frame.
             self._next_ns, self._ticks = (frames[0][0] if frames else until_ns) + TICK_NS, 0
         out: list[Frame] = []

@@ -10,7 +10,7 @@ import can
 import pytest
 
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.codec import known_identifiers
+from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
@@ -19,7 +19,7 @@ from tests.polled import STEADY, carried, kona, payload, request
 
 
 def test_the_daemon_reads_answers_and_sends_only_range_frames(tmp_path: Path):
-    channel = CanChannel("virtual", "answers", identifiers=known_identifiers(kona().mapping))
+    channel = CanChannel("virtual", "answers", identifiers=identifiers_of(kona().mapping))
     channel.open()
     recorder = Recorder(tmp_path, "kona")
     daemon = Daemon(kona(), [channel], recorder, None)

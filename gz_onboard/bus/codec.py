@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import cached_property
 from math import isnan
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -21,7 +22,6 @@ from gz_onboard.bus.layout import (
     MessageSignals,
     Values,
     crc_differences,
-    identifier_of,
     is_not_available,
     plausible_range,
     raw_range,
@@ -123,7 +123,7 @@ class MessageDecoder:
             time_ns, identifier, data, channel = frame
             is_own = origin.takes(time_ns - origin_ns, channel, identifier, data)
             if origin.conflict:
-                self._codec.count_fault(self.name, CONFLICT)
+                self._codec.faults[self.name, CONFLICT] += 1
             elif is_own:
                 own.append(frame)
             else:
@@ -132,11 +132,11 @@ class MessageDecoder:
 
     def _right(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
         """Those of `frames` whose length, checksum and counter are right, and the data of all of them."""
-        length, protection, count_fault = self.message.length, self.protection, self._codec.count_fault
+        length, protection, faults = self.message.length, self.protection, self._codec.faults
         parts = [frame[2] for frame in frames]
         if set(map(len, parts)) != {length}:
             wrong = [len(part) for part in parts if len(part) != length]
-            count_fault(self.name, LENGTH, len(wrong))
+            faults[self.name, LENGTH] += len(wrong)
             if self.origin is None:
                 self._codec.wrong_lengths[self.name] = wrong[-1]
             frames = [frame for frame in frames if len(frame[2]) == length]
@@ -146,12 +146,12 @@ class MessageDecoder:
             differences = crc_differences(data, length)
             if any(differences):
                 frames = [frame for frame, difference in zip(frames, differences, strict=True) if not difference]
-                count_fault(self.name, CRC, len(differences) - len(frames))
+                faults[self.name, CRC] += len(differences) - len(frames)
                 data = b"".join([frame[2] for frame in frames])
         if protection.counter and frames:
             right = self._follow_counter(frames, data, origin_ns)
             if len(right) < len(frames):
-                count_fault(self.name, COUNTER, len(frames) - len(right))
+                faults[self.name, COUNTER] += len(frames) - len(right)
                 frames, data = right, b"".join([frame[2] for frame in right])
         return frames, data
 
@@ -178,7 +178,7 @@ class MessageDecoder:
                 right.append(frame)
                 lost += missing
         if lost:
-            self._codec.lost[self.name] = self._codec.lost.get(self.name, 0) + lost
+            self._codec.lost[self.name] += lost
         return right
 
     def _decode(self, frames: Sequence[Frame], data: bytes, origin_ns: int) -> MessageWindow | None:
@@ -225,8 +225,13 @@ class MessageDecoder:
                 kept.append(row)
             else:
                 absent = self.not_available and is_not_available(signal, column[row])
-                self._codec.count_fault(f"{self.name}.{signal.name}", NOT_AVAILABLE if absent else RANGE)
+                self._codec.faults[f"{self.name}.{signal.name}", NOT_AVAILABLE if absent else RANGE] += 1
         return kept
+
+    @cached_property
+    def all_signals(self) -> MessageSignals:
+        """Decodes every signal of the message."""
+        return MessageSignals(self.message, self.not_available)
 
 
 class Codec:
@@ -240,24 +245,22 @@ class Codec:
         self.longest_pause_ns = longest_pause_ns  # None: any leap ahead is a pause
         self.leaps: list[tuple[float, float]] = []  # of the clock: when [s on our timeline], by how much [s]
         self.groups: list[Group] = []
-        self.faults: dict[tuple[str, str], int] = {}  # (message, reason) -> frames or signals dropped
-        self.lost: dict[str, int] = {}  # message -> frames that its counter shows as missing
-        self.unknown: dict[int, int] = {}  # identifier -> frames, of the first few thousand identifiers
+        self.faults: Counter[tuple[str, str]] = Counter()  # (message, reason) -> frames or signals dropped
+        self.lost: Counter[str] = Counter()  # message -> frames that its counter shows as missing
+        self.unknown: Counter[int] = Counter()  # identifier -> frames, of the first few thousand identifiers
         self.unknown_others = 0  # frames of further identifiers
         self.copies = 0  # frames of known messages from another channel or sender than they are taken from
         self.error_frames = 0
         self.received = 0
         self.latest: dict[str, Frame] = {}  # message or request -> the last good frame, or answer
         self.wrong_lengths: dict[str, int] = {}  # request -> bytes of the last answer that has another length
-        self._origin_ns: int | None = None
-        self._last_ns = -(1 << 80)  # before any frame: far from every time
+        self.origin_ns: int | None = None  # where the timeline begins, by the clock of the frames as it is set now
+        self.last_ns = 0  # the time of the last frame by that clock
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
-        self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion
+        self._before_ns = 0  # `last_ns` when it came: a good frame in between clears the suspicion
         self._ready: list[MessageWindow] = []  # from before the clock was set
-        self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
-        self._channel = 0  # of the last frame
-        self._inboxes: dict[int, dict[int, list[Frame]]] = {0: {}}  # by channel and identifier, of what was heard
+        self._inboxes: dict[int, dict[int, list[Frame]]] = {}  # by channel and identifier, of what was heard
         self._room = MOST_IDENTIFIERS  # for more of them
         self._errors: list[Frame] = []
         self._strangers: list[Frame] = []  # that no DBC file has
@@ -274,7 +277,7 @@ class Codec:
             for origin in self.origins
         }
         responses = by_response(mapping.requests)
-        self._answers = {response: AnswerReader(those, self.count_fault) for response, those in responses.items()}
+        self._answers = {response: AnswerReader(those, self.faults) for response, those in responses.items()}
         self._answering: dict[int, int] = {}  # channel by identifier of an answer: the first, as a gateway may copy it
         for request in (request for those in responses.values() for request in those):
             # All ones are a value: what limits are for.
@@ -286,17 +289,19 @@ class Codec:
 
     def decode(self, frames: Sequence[Frame]) -> None:
         """Take `frames` in for the window. Times are since the first frame ever decoded."""
-        heard, inboxes, last = self._channel, self._inboxes[self._channel], self._last_ns
         self.received += len(frames)
+        if self.origin_ns is None and frames:
+            self.origin_ns = self.last_ns = frames[0][0]
+        heard, inboxes, last = -1, dict[int, list[Frame]](), self.last_ns
         for frame in frames:
             step = frame[0] - last
             if 0 <= step <= AHEAD_NS:
                 last = frame[0]
             elif not -BACK_NS <= step < 0:
-                self._last_ns = last
-                if not self._retime(frame[0]):
+                self.last_ns = last
+                if not self.retime(frame[0]):
                     continue
-                last = self._last_ns
+                last = self.last_ns
             if frame[3] != heard:
                 heard = frame[3]
                 inboxes = self._inboxes.setdefault(heard, {})
@@ -304,18 +309,13 @@ class Codec:
                 inboxes[frame[1]].append(frame)
             except KeyError:
                 self.inbox(heard, frame[1]).append(frame)
-        self._last_ns, self._channel = last, heard
-
-    def take_at(self, frame: Frame, passed_ns: int) -> None:
-        """Take in a frame at this time on the timeline."""
-        self.begin_at(frame[0] - passed_ns)
-        self.inbox(frame[3], frame[1]).append(frame)
+        self.last_ns = last
 
     def begin_at(self, origin_ns: int | None) -> None:
         """Let the timeline begin at this time of the frames' clock, as it is set now."""
-        if origin_ns != self._origin_ns:
+        if origin_ns != self.origin_ns:
             self._ready += self._settle()
-            self._origin_ns = origin_ns
+            self.origin_ns = origin_ns
 
     def windows(self) -> list[MessageWindow]:
         """The values of each message since the last call, of those that came."""
@@ -327,10 +327,13 @@ class Codec:
         self.error_frames += len(self._errors)
         self.copies += len(self._copies)
         for identifier, count in Counter(map(_IDENTIFIER, self._strangers)).items():
-            self.count_unknown(identifier, count)
+            if identifier in self.unknown or len(self.unknown) < MOST_IDENTIFIERS:
+                self.unknown[identifier] += count
+            else:
+                self.unknown_others += count
         for waiting in (self._errors, self._copies, self._strangers, self._questions):
             waiting.clear()
-        origin_ns = self._origin_ns or 0
+        origin_ns = self.origin_ns or 0
         for reader in self._answers.values():
             for time_ns, identifier, data, channel in reader.inbox:
                 for request, answer in reader.take((time_ns - origin_ns) * 1e-9, data):
@@ -339,58 +342,41 @@ class Codec:
         decoders = self.decoders.values()
         return [window for decoder in decoders if decoder.inbox and (window := decoder.window(origin_ns))]
 
-    @property
-    def started(self) -> bool:
-        """Whether any frame has come."""
-        return self._origin_ns is not None
-
-    @property
-    def passed(self) -> float:
-        """The time of the last frame on the timeline [s]."""
-        return self.seconds(self._last_ns)
-
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline [s]."""
-        return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
+        return 0.0 if self.origin_ns is None else (time_ns - self.origin_ns) * 1e-9
 
     def time_ns(self, seconds: float) -> int:
         """`seconds` of the timeline by the clock of the frames, as it is set now [ns]; 0 before the first frame."""
-        return 0 if self._origin_ns is None else max(self._origin_ns + round(seconds * 1e9), 0)
-
-    @property
-    def last_ns(self) -> int:
-        """The time of the last frame by their clock as it is set now [ns]; 0 before the first."""
-        return 0 if self._origin_ns is None else self._last_ns
+        return 0 if self.origin_ns is None else max(self.origin_ns + round(seconds * 1e9), 0)
 
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
-        if self._origin_ns is not None:
-            self.begin_at(self._origin_ns + delta_ns)
-            self._last_ns += delta_ns
+        if self.origin_ns is not None:
+            self.begin_at(self.origin_ns + delta_ns)
+            self.last_ns += delta_ns
 
-    def _retime(self, time_ns: int) -> bool:
+    def retime(self, time_ns: int) -> bool:
         """Take a time that does not follow the last one: True if the frame is to be used.
 
         One odd stamp is dropped. Several in a row that follow each other mean that the clock was set: back, or ahead by
         more than the longest pause, and the timeline goes on from where it was; else ahead, and it is taken as a gap in
         the recording.
         """
-        if self._origin_ns is None:
-            self._origin_ns = self._last_ns = time_ns
-            return True
-        follows = self._before_ns == self._last_ns and -BACK_NS <= time_ns - self._suspect_ns <= AHEAD_NS
+        assert self.origin_ns is not None
+        follows = self._before_ns == self.last_ns and -BACK_NS <= time_ns - self._suspect_ns <= AHEAD_NS
         self._suspects = self._suspects + 1 if follows and self._suspects else 1
-        self._suspect_ns, self._before_ns = time_ns, self._last_ns
+        self._suspect_ns, self._before_ns = time_ns, self.last_ns
         if self._suspects < CONFIRM:
-            self.count_fault("", TIME)
+            self.faults["", TIME] += 1
             return False
         self._suspects = 0
-        leap = time_ns - self._last_ns
+        leap = time_ns - self.last_ns
         if leap < 0 or (self.longest_pause_ns is not None and leap > self.longest_pause_ns):
             if len(self.leaps) < _MOST_LEAPS:
-                self.leaps.append((self.seconds(self._last_ns), leap * 1e-9))
-            self.begin_at(self._origin_ns + leap)
-        self._last_ns = time_ns
+                self.leaps.append((self.seconds(self.last_ns), leap * 1e-9))
+            self.begin_at(self.origin_ns + leap)
+        self.last_ns = time_ns
         return True
 
     # --- where frames go --------------------------------------------------------------------------------------
@@ -423,28 +409,6 @@ class Codec:
         found = [(c & ~TRANSMITTED, i) for c, known in self._inboxes.items() for i in known if known[i] is inbox]
         return sorted(set(found))
 
-    def count_unknown(self, identifier: int, count: int) -> None:
-        """Count frames with an identifier that no DBC file has."""
-        if identifier in self.unknown or len(self.unknown) < MOST_IDENTIFIERS:
-            self.unknown[identifier] = self.unknown.get(identifier, 0) + count
-        else:
-            self.unknown_others += count
-
-    def count_fault(self, place: str, reason: str, count: int = 1) -> None:
-        """Count frames of a message, or values of a signal, that were dropped."""
-        self.faults[place, reason] = self.faults.get((place, reason), 0) + count
-
     def values(self, name: str, data: bytes) -> Values:
         """Every signal of a message or an answer in the units of the DBC, see `MessageSignals.values`."""
-        if (signals := self._signals.get(name)) is None:
-            decoder = self.decoders[name]
-            self._signals[name] = signals = MessageSignals(decoder.message, decoder.not_available)
-        return signals.values(data) or {}
-
-
-def known_identifiers(mapping: BusMapping) -> list[int] | None:
-    """The identifiers (with flags) that the database knows, for the kernel's filters; None if it goes by PGN."""
-    if mapping.j1939:
-        return None
-    asked = {one for request in mapping.requests for one in (request.request, request.response, *FUNCTIONAL)}
-    return [*(identifier_of(message) for message in mapping.database.messages), *sorted(asked)]
+        return self.decoders[name].all_signals.values(data) or {}

@@ -22,12 +22,13 @@ def identifier_of(message: Message) -> int:
     return int(message.frame_id) | (EFF_FLAG if message.is_extended_frame else 0)
 
 
-def identifiers_of(mapping: BusMapping, messages: Collection[str]) -> list[int] | None:
-    """Of the frames that bring `messages`, answers too; None: any, as a J1939 sender may have any."""
+def identifiers_of(mapping: BusMapping, messages: Collection[str] | None = None) -> list[int] | None:
+    """Of the frames that bring `messages`, by default all, and of requests; None: any, as of a J1939 sender."""
     if mapping.j1939:
         return None
-    found = [identifier_of(m) for m in mapping.database.messages if m.name in messages]
-    return found + [request.response for request in mapping.requests if request.name in messages]
+    found = [identifier_of(m) for m in mapping.database.messages if messages is None or m.name in messages]
+    requests = [request for request in mapping.requests if messages is None or request.name in messages]
+    return found + [one for request in requests for one in (request.request, request.response)]
 
 
 def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:

@@ -7,7 +7,8 @@ spread over frames; it is complete or dropped and counted. There is no clock: a 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -169,11 +170,13 @@ def _first_byte(table: Table) -> int:
 
 
 class Assembler:
-    """Assembles the answers on one identifier. address: the first byte of each frame, if it has one."""
+    """Assembles the answers on one identifier. address: the first byte of each frame, if it has one.
 
-    def __init__(self, address: int | None, fault: Callable[[str], None]) -> None:
-        self._address = address
-        self._fault = fault
+    faults: counts (place, reason) of what is dropped.
+    """
+
+    def __init__(self, address: int | None, place: str, faults: Counter[tuple[str, str]]) -> None:
+        self._address, self._place, self._faults = address, place, faults
         self._data = bytearray()
         self._length = 0  # of the answer that is being assembled; 0: none is
         self._skips = True  # consecutive frames of an answer that was dropped, or started before we listened
@@ -222,24 +225,24 @@ class Assembler:
         return bytes(self._data)
 
     def _drop(self, reason: str) -> None:
-        self._fault(reason)
+        self._faults[self._place, reason] += 1
         self._length, self._skips = 0, True
 
 
 class AnswerReader:
-    """Finds the answers to `requests`, all on one identifier. fault: counts (identifier, reason)."""
+    """Finds the answers to `requests`, all on one identifier. faults: counts (identifier, reason) of those dropped."""
 
-    def __init__(self, requests: Sequence[Request], fault: Callable[[str, str], None]) -> None:
+    def __init__(self, requests: Sequence[Request], faults: Counter[tuple[str, str]]) -> None:
         self.inbox: list[Frame] = []
-        self._requests, self._fault = requests, fault
+        self._requests, self._faults = requests, faults
         self._place, addresses = f"{requests[0].response & 0x1FFFFFFF:#x}", requests[0].addresses
-        self._assembler = Assembler(addresses[1] if addresses else None, lambda reason: fault(self._place, reason))
+        self._assembler = Assembler(addresses[1] if addresses else None, self._place, faults)
 
     def take(self, time: float, data: bytes) -> list[tuple[Request, bytes]]:
         """The request and the bytes behind its data identifier if the frame of `time` [s] completes an answer."""
         payload = self._assembler.take(time, data) or b""
         if payload[:1] == bytes([NEGATIVE_RESPONSE]) and payload[2:3] and payload[2] != PENDING:
-            self._fault(self._place, f"{NEGATIVE} {payload[2]:#04x}")
+            self._faults[self._place, f"{NEGATIVE} {payload[2]:#04x}"] += 1
         return [(one, payload[len(one.prefix) :]) for one in self._requests if payload.startswith(one.prefix)]
 
 

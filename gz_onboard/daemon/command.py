@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.codec import known_identifiers
+from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.bus.recorder import LogLimits, Recorder
 from gz_onboard.daemon.control import SOCKET
 from gz_onboard.daemon.loop import Daemon, foreign_text, status_text
@@ -113,7 +113,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         total = round(arguments.log_total_mb * 1e6)
         limits = LogLimits(max_file_bytes=LOG_FILE_BYTES, max_age_s=LOG_FILE_S, max_total_bytes=total)
         recorder = Recorder(arguments.log_dir, vehicle.name, metadata, dbc_texts(vehicle), limits)
-    identifiers = None if arguments.all_frames else known_identifiers(vehicle.mapping)
+    identifiers = None if arguments.all_frames else identifiers_of(vehicle.mapping)
     if identifiers is not None:  # our own too: another sender of them is reported
         identifiers += sorted(vehicle.publisher().identifiers)
     channels = [CanChannel(arguments.interface, name, index, identifiers) for index, name in enumerate(names)]

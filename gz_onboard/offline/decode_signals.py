@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
+from gz_onboard.bus.codec import LENGTH
 from gz_onboard.bus.layout import MessageSignals, Values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
@@ -23,7 +25,8 @@ class Decoder:
     """Decodes all signals of the frames of one bus, and of answers; counts the frames that it cannot decode."""
 
     def __init__(self, mapping: BusMapping) -> None:
-        self.unknown = self.undecodable = self.copies = 0
+        self.unknown = self.copies = 0
+        self._faults: Counter[tuple[str, str]] = Counter()
         messages, requests = mapping.database.messages, mapping.requests
         self.origins = Origins(mapping, {message.name for message in messages})
         self.all_messages: list[Message] = [*messages, *(request.message for request in requests)]
@@ -31,7 +34,7 @@ class Decoder:
         self._signals = {message.name: MessageSignals(message, mapping.not_available) for message in messages}
         self._signals |= {request.name: MessageSignals(request.message, not_available=False) for request in requests}
         self._answers = {
-            response: AnswerReader(those, self._dropped) for response, those in by_response(requests).items()
+            response: AnswerReader(those, self._faults) for response, those in by_response(requests).items()
         }
         self._asked = {request.request for request in requests}
 
@@ -51,13 +54,15 @@ class Decoder:
 
     def _decoded(self, time_ns: int, message: Message, data: bytes) -> Iterator[Decoded]:
         if (values := self._signals[message.name].values(data)) is None:
-            self.undecodable += 1
+            self._faults[message.name, LENGTH] += 1
         else:
             pairs = zip(self.columns[message.name], message.signals, strict=True)
             yield time_ns, message.name, {column: values.get(signal.name) for column, signal in pairs}
 
-    def _dropped(self, _message: str, reason: str) -> None:
-        self.undecodable += not reason.startswith(NEGATIVE)
+    @property
+    def undecodable(self) -> int:
+        """Frames of another length than their message, and answers that were dropped."""
+        return sum(count for (_, reason), count in self._faults.items() if not reason.startswith(NEGATIVE))
 
 
 def column_name(signal: Signal) -> str:

@@ -121,15 +121,16 @@ def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
         raise _of_another(log, vehicle, codec)
     for conflict in codec.origins.conflicts.values():
         raise vehicle.error(f"{log}: {conflict}")
-    if codec.received > 1 and not codec.passed and not codec.leaps and not codec.faults.get(("", TIME)):
+    passed = codec.seconds(codec.last_ns)
+    if codec.received > 1 and not passed and not codec.leaps and not codec.faults.get(("", TIME)):
         raise InputError(f"{log}: all its {codec.received} frames have one and the same time; that is not a ride")
     back = sum(leap < 0 for _, leap in codec.leaps)
-    if back > _MOST_BACK and back > codec.passed:
+    if back > _MOST_BACK and back > passed:
         raise InputError(
-            f"{log}: its time runs back again and again, at least {back} times within {max(codec.passed, 0.0):.0f} s; "
+            f"{log}: its time runs back again and again, at least {back} times within {max(passed, 0.0):.0f} s; "
             "sort its frames by time, or record it again"
         )
-    if codec.passed < 0 or (back and not codec.passed):
+    if passed < 0 or (back and not passed):
         raise InputError(f"{log}: its last frame is not after its first; sort its frames by time, or record it again")
 
 

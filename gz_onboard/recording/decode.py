@@ -113,7 +113,7 @@ class DecodedLog:
         self._decoded: list[_Decoded] = []
         self._one_by_one: Rows = np.zeros(0, np.int64)
         self._decode(kept)
-        self._origin_ns = codec._origin_ns
+        self._origin_ns = codec.origin_ns
 
     def samples(self) -> dict[str, Column]:
         """(times [s], values in SI units) by role, in the order of the frames."""
@@ -271,7 +271,8 @@ class DecodedLog:
     def _take(self, rows: Rows) -> None:
         """Let the codec take the frames in these rows, at their times on the timeline."""
         for row, frame in zip(rows.tolist(), self.frames[rows].tuples() if len(rows) else (), strict=True):
-            self.codec.take_at(frame, int(self._passed_ns[row]))
+            self.codec.begin_at(frame[0] - int(self._passed_ns[row]))
+            self.codec.inbox(frame[3], frame[1]).append(frame)
 
     def _samples_one_by_one(self) -> dict[str, Column]:
         """The samples of the frames that the codec decodes itself."""

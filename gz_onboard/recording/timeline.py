@@ -63,18 +63,19 @@ def on_timeline(time_ns: NDArray[np.int64], codec: Codec) -> tuple[NDArray[np.bo
     """
     kept = np.ones(len(time_ns), bool)
     origins = np.zeros(len(time_ns), np.int64)
-    last, place = codec._last_ns, 0
+    if codec.origin_ns is None and len(time_ns):
+        codec.origin_ns = codec.last_ns = int(time_ns[0])
+    last, place = codec.last_ns, 0
     while place < len(time_ns):
-        if codec.started:
-            end, last, _ = _follow(time_ns, place, last, AHEAD_NS)
-            origins[place:end] = _wrapped(codec._origin_ns or 0)
-            place = end
+        end, last, _ = _follow(time_ns, place, last, AHEAD_NS)
+        origins[place:end] = _wrapped(codec.origin_ns or 0)
+        place = end
         if place < len(time_ns):
-            codec._last_ns = last
-            kept[place] = codec._retime(int(time_ns[place]))
-            origins[place] = _wrapped(codec._origin_ns or 0)
-            last, place = codec._last_ns, place + 1
-    codec._last_ns = last
+            codec.last_ns = last
+            kept[place] = codec.retime(int(time_ns[place]))
+            origins[place] = _wrapped(codec.origin_ns or 0)
+            last, place = codec.last_ns, place + 1
+    codec.last_ns = last
     return kept, time_ns - origins
 
 

@@ -27,8 +27,8 @@ class Taken:
     """What an assembler makes of frames a millisecond apart."""
 
     def __init__(self, frames: list[bytes], address: int | None = None, step: float = 0.001) -> None:
-        self.faults: Counter[str] = Counter()
-        assembler = Assembler(address, lambda reason: self.faults.update([reason]))
+        self.faults: Counter[tuple[str, str]] = Counter()
+        assembler = Assembler(address, "", self.faults)
         taken = (assembler.take(i * step, frame) for i, frame in enumerate(frames))
         self.answers = [one for one in taken if one is not None]
 
@@ -55,7 +55,7 @@ def test_a_frame_that_is_lost_repeated_or_late_leaves_no_answer(sent, data):
     if 0 < at < len(frames) - 1:
         twice = Taken([*frames[: at + 1], *frames[at:], *carried(b"last")])
         assert twice.answers == [b"last"]
-        assert twice.faults == {SEQUENCE: 1}
+        assert twice.faults == {("", SEQUENCE): 1}
     assert Taken([*frames, *carried(b"last")], step=1.1).answers == [b"last"]
 
 
@@ -73,14 +73,14 @@ def test_of_answers_between_each_other_only_whole_ones_are_left(sent, random):
 @given(st.lists(st.tuples(st.floats(0, 2), st.binary(max_size=12)), max_size=60))
 @example([(0.0, b""), (0.0, b"\x10"), (0.0, b"\x10\x07aaaaaa"), (0.0, b"\x00\x20aaaaaa"), (0.0, b"\x3f")])
 def test_any_frames_at_all_give_no_more_than_their_bytes(frames):
-    faults: Counter[str] = Counter()
-    assembler = Assembler(None, lambda reason: faults.update([reason]))
+    faults: Counter[tuple[str, str]] = Counter()
+    assembler = Assembler(None, "", faults)
     seen = b""
     for time, data in frames:
         seen += data
         found = assembler.take(time, data)
         assert found is None or (found and len(found) <= len(seen))
-    assert set(faults) <= {SEQUENCE, INTERRUPTED, MALFORMED}
+    assert {reason for _, reason in faults} <= {SEQUENCE, INTERRUPTED, MALFORMED}
 
 
 def test_another_testers_answers_are_not_ours():

@@ -11,20 +11,9 @@ from cantools.database.can import Database
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.codec import (
-    CONFLICT,
-    COUNTER,
-    CRC,
-    LENGTH,
-    LONGEST_PAUSE_NS,
-    NOT_AVAILABLE,
-    RANGE,
-    TIME,
-    Codec,
-    known_identifiers,
-)
+from gz_onboard.bus.codec import CONFLICT, COUNTER, CRC, LENGTH, LONGEST_PAUSE_NS, NOT_AVAILABLE, RANGE, TIME, Codec
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.layout import crc8_sae_j1850
+from gz_onboard.bus.layout import crc8_sae_j1850, identifiers_of
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
@@ -449,7 +438,7 @@ def test_j1939_goes_by_the_parameter_group(tmp_path):
     for identifier in (0x0CF00500 | EFF_FLAG, 0x0CF00400 | EFF_FLAG | RTR_FLAG, 0x400):
         assert events_of(codec, [(0, identifier, speed, 0)]) == []
     assert len(codec.unknown) == 3
-    assert known_identifiers(mapping) is None
+    assert identifiers_of(mapping) is None
 
 
 TWO_BUSES = """BU_: A
@@ -574,7 +563,7 @@ def test_j1939_one_that_babbles_first_keeps_no_known_group_out(tmp_path):
 
 def test_known_identifiers_are_those_of_the_database(tmp_path):
     mapping = mapping_of(tmp_path, J1939, 'throttle = "Group"')
-    assert set(known_identifiers(mapping) or []) == {0x0CF00400 | EFF_FLAG, 0x18EA0000 | EFF_FLAG, 256}
+    assert set(identifiers_of(mapping) or []) == {0x0CF00400 | EFF_FLAG, 0x18EA0000 | EFF_FLAG, 256}
 
 
 # --- multiplexed and floating-point signals, which cantools decodes ----------------------------------------------

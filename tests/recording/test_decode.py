@@ -26,7 +26,7 @@ from tests.support import EPOCH, LOGS, MS, S
 
 DAY = 86_400 * S
 COUNTED = ("faults", "lost", "unknown", "unknown_others", "copies", "error_frames", "received", "latest", "leaps")
-LEFT = (*COUNTED, "wrong_lengths", "passed", "last_ns")
+LEFT = (*COUNTED, "wrong_lengths", "origin_ns", "last_ns")
 """What a codec is left with."""
 
 
