@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import re
-import sys
 from collections.abc import Collection, Sequence
 from functools import cache
 from pathlib import Path
@@ -22,16 +21,17 @@ if TYPE_CHECKING:
 
 FARTHEST = 1e30  # of a limit of a signal; some editors write out those of its type
 LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
-LONGEST_FRAME = 64  # bytes, of CAN FD
 _WIDE = re.compile(r"\b(BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)(\s+)(\d{4,9})\b")
 _BUS_LINE = re.compile(r"^[ \t]*BS_[ \t]*:", re.M)
 _BELOW_BUS_LINE = re.compile(r"^[ \t]*(?:BU_[ \t]*:|BO_[ \t]+\d+[ \t]+\w+[ \t]*:)", re.M)
 LONGEST_PROBLEM = 400  # letters of what cantools says, which may quote a whole line
 SMALLEST, LARGEST = 1e-12, 1e12  # a scale or an offset
 _END = '\nCM_ "";\n'  # an empty comment: a last statement that is cut off is none to cantools, one in between is wrong
-_MESSAGE_SIZE = re.compile(r"^[ \t]*BO_[ \t]+\d+[ \t]+(\w+)[ \t]*:[ \t]*(\d+)", re.M)
-_SIGNAL_SIZE = re.compile(r"^[ \t]*SG_[ \t]+(\w+)[^:\n\"]*:[ \t]*(\d+)[ \t]*\|[ \t]*(\d+)", re.M)
-
+_HUGE = re.compile(
+    r"""^\s* (?: BO_ \s+ \d+ \s+ (\w+) \s*:\s* \d{3} | SG_ \s+ (\w+) [^:\n"]* :\s* (?:\d{4} | \d+ \s*\|\s* \d{4}))""",
+    re.M | re.X,
+)
+"""Begins a message of 100 bytes or more, or a signal with bits of four digits, over which cantools takes gigabytes."""
 _MESSAGE_NAME = re.compile(r"\s*BO_\s+\d+\s+(\w+)")
 _SIGNAL_NAME = re.compile(r"\s*SG_\s+([^\s:]+)")
 _DECIDES_OTHERS = re.compile(r"\s*(SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_)")  # without it another signal is read otherwise
@@ -54,12 +54,9 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 def find_dbc(name: str, beside: Path | None = None) -> Path:
     """The path of the DBC file `name`: in the folder `beside`, or one that comes with this package."""
-    places = [_PACKAGE / "dbc", _PACKAGE.parent / "dbc"]
-    if beside:
-        places.insert(0, beside)
-    for place in places:
-        if is_file(place / name):
-            return place / name
+    places = [*([beside] if beside else []), _PACKAGE / "dbc", _PACKAGE.parent / "dbc"]
+    if found := next((place / name for place in places if is_file(place / name)), None):
+        return found
     if Path(name).is_dir():
         raise InputError(f"{name}: is a folder; give the DBC file in it")
     own = [file.name for place in places if place.is_dir() for file in place.glob("*.dbc")]
@@ -69,11 +66,8 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
 def empty_database(strict: bool = True) -> Database:
     """A cantools database, to which DBC files are added; `strict`: signals must fit and may not overlap."""
     logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
-    if "cantools" in sys.modules:
+    with without(*_UNUSED):
         from cantools.database.can import Database
-    else:
-        with without(*_UNUSED):
-            from cantools.database.can import Database
     return Database(strict=strict)
 
 
@@ -124,8 +118,9 @@ class _DbcFile:
 
     def messages(self) -> list[Message]:
         """The usable messages. A warning lists the parts that were left out."""
-        if problem := _impossible_size(self._text):
-            raise self.invalid(problem)
+        if huge := _HUGE.search(self._text):
+            line = self._text.count("\n", 0, huge.end()) + 1
+            raise self.invalid(f"{huge[1] or huge[2]} at line {line} goes beyond the longest frame, of 64 bytes")
         messages = [self._without_bad_signals(message) for message in self._parsed().messages]
         if said := list(self._said):
             more = f"; and {len(said) - MOST_SAID} more" if len(said) > MOST_SAID else ""
@@ -264,18 +259,6 @@ def _completed(file: Path, text: str) -> str:
         more = f" and {len(wide) - MOST_SAID} more" if len(wide) > MOST_SAID else ""
         _warn_once(f"{file}: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: {numbers}{more}")
     return text
-
-
-def _impossible_size(text: str) -> str | None:
-    """The fault of a layout that no frame has, if there is one; cantools would take gigabytes over it."""
-    for found in _MESSAGE_SIZE.finditer(text):
-        if len(found[2]) > 2 or int(found[2]) > LONGEST_FRAME:
-            return f"message {found[1]} has {shown(found[2])} bytes, the most are {LONGEST_FRAME}"
-    for found in _SIGNAL_SIZE.finditer(text):
-        if any(len(number) > 3 or int(number) > 8 * LONGEST_FRAME for number in (found[2], found[3])):
-            line = text.count("\n", 0, found.start()) + 1
-            return f"signal {found[1]} at line {line} reaches beyond the longest frame"
-    return None
 
 
 def _signal_problem(signal: Signal) -> str | None:
