@@ -7,7 +7,6 @@ gives nothing of a file whose end is missing when it seeks, and stops at the fir
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -16,9 +15,10 @@ from typing import Any
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from gz_onboard.bus import framelog
@@ -27,10 +27,10 @@ from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
 from gz_onboard.recording.readers.contents import Contents, LogDamage
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
-_CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
+_COMPRESSION_AT = 28  # bytes from the beginning of a chunk
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _ZSTD_CHUNK = b"\x04\x00\x00\x00zstd"
-_BROKEN = (ValueError, OverflowError, struct.error, EndOfFile)  # what reading a broken record raises
+_BROKEN = (ValueError, OverflowError, struct.error, McapError, zstandard.ZstdError)  # raised for a broken record
 _LARGEST_CHUNK = 64 << 20  # bytes, unpacked; ours have 300 kB
 
 _BLOCK_HEAD = struct.Struct("<BBHIqI")  # version, bytes of a step, kinds, frames, time of the first, unit of a step
@@ -154,7 +154,10 @@ def decode_block(block: bytes) -> FrameColumns:
     planes = np.frombuffer(block, np.uint8, (count - 1) * width, steps_at).reshape(width, count - 1)
     steps = np.ascontiguousarray(planes.T).view(f"<i{width}").ravel()
     frames = FrameColumns.empty(count, int(table["length"].max()))
-    frames.time_ns[:] = _times(first, steps, unit)
+    times = first + np.cumsum(steps.astype(np.int64) * unit)
+    exact = first + np.cumsum(steps.astype(float)) * unit
+    frames.time_ns[0] = first
+    frames.time_ns[1:] = np.where(np.abs(exact - times) < TIME_LIMIT_NS, times, -1)  # none where they leave 64 bits
     for name in ("identifier", "channel", "length"):
         getattr(frames, name)[:] = table[name][kind]
     numbers = np.bincount(kind, minlength=kinds)
@@ -166,17 +169,6 @@ def decode_block(block: bytes) -> FrameColumns:
         frames.data[rows[start : start + number], :length] = data.T
         position, start = position + number * length, start + number
     return frames
-
-
-def _times(first: int, steps: np.ndarray[Any, Any], unit: int) -> np.ndarray[Any, Any]:
-    """Times [ns] from the first and the steps after it; -1 where one leaves 64 bits."""
-    times = np.zeros(len(steps) + 1, np.int64)
-    np.cumsum(steps.astype(np.int64) * unit, out=times[1:])
-    times += first
-    if abs(first) + (len(steps) * unit << 8 * steps.itemsize - 1) < TIME_LIMIT_NS:
-        return times
-    exact = np.concatenate(([0.0], np.cumsum(steps.astype(float)) * unit)) + float(first)
-    return np.where(np.abs(exact - times) < TIME_LIMIT_NS, times, -1)
 
 
 def _records(data: Contents, damage: LogDamage) -> Iterator[tuple[int, int, int]]:
@@ -215,7 +207,7 @@ def _split(data: Contents, position: int, limit: int) -> Iterator[tuple[int, int
 
 def _next_chunk(data: Contents, position: int) -> int:
     """Where the next chunk record that fits into the file begins, or -1: found by the name of its compression."""
-    offset = _RECORD.size + _CHUNK.size - 4
+    offset = _RECORD.size + _COMPRESSION_AT
     found = data.find(_ZSTD_CHUNK, position + offset)
     while found >= 0:
         opcode, length = _RECORD.unpack_from(data, found - offset)
@@ -225,26 +217,16 @@ def _next_chunk(data: Contents, position: int) -> int:
     return -1
 
 
-def _unpack_chunk(content: Contents) -> bytes:
-    """The records in a chunk. Raises ValueError or struct.error if it is broken."""
-    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
-    packed_at = _CHUNK.size + name_length + 8
-    if packed_at > len(content):
-        raise ValueError("the name of its compression is cut off")
+def _unpack_chunk(content: bytes) -> bytes:
+    """The records in a chunk. Raises one of `_BROKEN`."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+    size = chunk.uncompressed_size
     if size > _LARGEST_CHUNK:
         raise ValueError(f"it says that it unpacks to {size} bytes")
-    name, packed = content[_CHUNK.size : _CHUNK.size + name_length], content[packed_at:]
-    if name == b"zstd":
-        try:
-            # The decompressor would make room for whatever the packed data say of themselves.
-            inside = zstandard.frame_content_size(packed)
-            if inside not in (size, -1):
-                raise ValueError(f"it unpacks to {inside} bytes, not {size}")
-            packed = zstandard.ZstdDecompressor(max_window_size=_LARGEST_CHUNK).decompress(packed, size)
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from None
-    elif name:
-        raise ValueError(f"compression {name.decode('ascii', 'replace')!r} is not supported")
-    if len(packed) != size or (crc and zlib.crc32(packed) != crc):
-        raise ValueError("its checksum is wrong")
-    return packed
+    # The decompressor would make room for whatever the packed data say of themselves.
+    if chunk.compression == "zstd" and (inside := zstandard.frame_content_size(chunk.data)) not in (size, -1):
+        raise ValueError(f"it unpacks to {inside} bytes, not {size}")
+    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+    if length != size:
+        raise ValueError(f"it unpacks to {length} bytes, not {size}")
+    return stream.read(size)
