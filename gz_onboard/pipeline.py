@@ -10,8 +10,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 
 from gz_onboard.bus.codec import DROPPING, RANGE, Codec
-from gz_onboard.bus.layout import identifier_of
-from gz_onboard.bus.mapping import pgn
+from gz_onboard.bus.origins import Origins
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
@@ -210,11 +209,8 @@ class Pipeline:
         if estimate.battery_ends_latitude is not None and estimate.battery_ends_longitude is not None:
             there = estimate.battery_ends_latitude, estimate.battery_ends_longitude
             log.sample(BATTERY_ENDS_TOPIC, time_ns, location_row(time_ns, "battery_ends", *there, None))
-        if self.signal_log:
-            self._sample_signals(self.signal_log, now, time_ns)
-
-    def _sample_signals(self, log: Log, now: float, time_ns: int) -> None:
-        """Log the latest signals of each message, at the time of their frame, and the position."""
+        if not self.signal_log:
+            return
         logged_ns = time_ns - WINDOWS_PER_RANGE * WINDOW_NS  # what was seen until then was logged before
         for name, (seen_ns, _, data, _) in self.codec.latest.items():
             if seen_ns > logged_ns:
@@ -231,7 +227,8 @@ class Pipeline:
 
     def status(self) -> dict[str, object]:
         """Return the counts since the start by message and reason, the ride so far, and the learned values."""
-        codec = self.codec
+        codec, estimator, last = self.codec, self.estimator, self.last or Estimate(0.0)
+        ambient = estimator.signals.ambient_temperature.get(last.time)
         faults: dict[str, dict[str, int]] = {}
         for (message, reason), count in sorted(codec.faults.items()):
             faults.setdefault(reason, {})[message or "any"] = count
@@ -248,17 +245,10 @@ class Pipeline:
             "faults": faults,
             "lost": dict(sorted(codec.lost.items())),
             "unknown": {hexadecimal(i): n for i, n in sorted(codec.unknown.items())[:32]},
-            "reasons": reason_names(self.last.reasons) if self.last else [],
-            "ride": self._ride(),
-            "learned": learned_row(self.estimator.pack.learned()),
+            "reasons": reason_names(last.reasons),
+            "ride": ride_row(last, self.energy, ambient, estimator.forecaster.learner.rider),
+            "learned": learned_row(estimator.pack.learned()),
         }
-
-    def _ride(self) -> dict[str, object]:
-        """Return facts of the ride that the logged estimates do not hold."""
-        last, estimator = self.last or Estimate(0.0), self.estimator
-        return ride_row(
-            last, self.energy, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.learner.rider
-        )
 
 
 def range_publisher(vehicle: Vehicle) -> Publisher:
@@ -267,12 +257,11 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
     InputError if its own messages take their identifiers, or if they cannot say what its battery holds, or how far
     that takes it by the prior riding.
     """
-    publisher = vehicle.publisher()
-    mapping = vehicle.mapping
-    asked = [one for request in mapping.requests for one in (request.request, request.response)]
-    known = {_frame_key(vehicle, i) for i in (*map(identifier_of, mapping.database.messages), *asked)}
-    if clash := [i for i in publisher.identifiers if _frame_key(vehicle, i) in known]:
-        free = next(i for i in FREE if not any(_frame_key(vehicle, i + n) in known for n in range(MESSAGES)))
+    publisher, mapping = vehicle.publisher(), vehicle.mapping
+    asked = {one for request in mapping.requests for one in (request.request, request.response)}
+    origins = Origins(mapping, ())
+    if clash := [i for i in publisher.identifiers if i in asked or origins.find(i)]:
+        free = next(i for i in FREE if not any(i + n in asked or origins.find(i + n) for n in range(MESSAGES)))
         raise vehicle.error(
             f"its DBC files or requests take the identifiers of our own range frames ({publisher.file}): "
             f"{', '.join(hexadecimal(i) for i in sorted(clash))}; give range_identifier = {free:#x}, "
@@ -293,12 +282,6 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
                     'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
                 )
     return publisher
-
-
-def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:
-    """Return the key by which the vehicle's codec finds a frame."""
-    extended, plain = bool(identifier & EFF_FLAG), identifier & ~EFF_FLAG
-    return extended, pgn(plain) if extended and vehicle.mapping.j1939 else plain
 
 
 def lacking(vehicle: Vehicle) -> list[str]:
