@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -98,15 +99,19 @@ def replay(
     return summary
 
 
-def bus_sender(bus: can.BusABC) -> Send:
-    """Sends by python-can. Waits for room in a full queue; a bus that is down loses frames, as a bus does."""
+def bus_sender(*buses: can.BusABC) -> Send:
+    """Sends by python-can, on one bus, or on the bus of the frame's channel.
+
+    Waits for room in a full queue; a bus that is down loses frames, as a bus does.
+    """
     from gz_onboard.bus._can import can
     from gz_onboard.recording.readers.python_can import message_of
 
     def send(frame: Frame) -> bool:
+        bus = buses[frame[3] & ~TRANSMITTED] if len(buses) > 1 else buses[0]
         for _ in range(_FULL_ATTEMPTS):
             try:
-                bus.send(message_of(frame, with_time=False))
+                bus.send(message_of(frame))
                 return True
             except (can.CanError, OSError) as error:
                 if getattr(error, "error_code", getattr(error, "errno", None)) not in (errno.ENOBUFS, errno.EAGAIN):
@@ -143,14 +148,15 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--speed {arguments.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more"
         )
+    channels = [name for name in arguments.channel.split(",") if name]
+    if not channels:
+        raise InputError("--channel: no channel is named")
     damages: list[LogDamage] = []
-    parts = _parts(arguments, damages)  # a missing log is named before a missing bus
-    buses = _open_buses(arguments.interface, [name for name in arguments.channel.split(",") if name])
-    senders = [bus_sender(bus) for bus in buses]
-    summary = Sent()
-    status = OK
-    try:
-        with progress_bar(lambda: None, quiet=arguments.quiet) as display:
+    summary, status = Sent(), OK
+    parts = _parts(arguments, len(channels), summary, damages)  # a missing log is named before a missing bus
+    with ExitStack() as buses, progress_bar(lambda: None, quiet=arguments.quiet) as display:
+        send = bus_sender(*(buses.enter_context(_open_bus(arguments.interface, name)) for name in channels))
+        try:
             while True:
                 summary.loops += 1
                 for log, frames in parts:
@@ -159,27 +165,25 @@ def run(arguments: argparse.Namespace) -> int:
                     def show(seconds: float, what: str = what) -> None:
                         display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
 
-                    kept = _sendable(frames, len(senders))
-                    summary.skipped += len(frames) - len(kept)
-                    replay(kept.batches(), _by_channel(senders), arguments.speed, summary, show)
-                if not summary.sent and not summary.failed:
-                    raise InputError(f"{arguments.log}: no frames to send in the chosen part")
+                    replay(frames.batches(), send, arguments.speed, summary, show)
                 if not arguments.loop:
                     break
                 time.sleep(_LOOP_GAP_S)
-    except KeyboardInterrupt:
-        status = INTERRUPTED
-    finally:
-        for bus in buses:
-            bus.shutdown()
+        except KeyboardInterrupt:
+            status = INTERRUPTED
     for text in dict.fromkeys(map(str, damages)):
         print(text, file=sys.stderr)
     print(f"replayed {arguments.log}: {summary}")
     return status
 
 
-def _parts(arguments: argparse.Namespace, damages: list[LogDamage]) -> list[tuple[Path, FrameColumns]]:
-    """Read the frames to be sent of each log, before the bus is opened. Raises InputError for a missing log."""
+def _parts(
+    arguments: argparse.Namespace, channels: int, summary: Sent, damages: list[LogDamage]
+) -> list[tuple[Path, FrameColumns]]:
+    """Read the frames of each log that can be sent on so many channels; the others are counted in `summary`.
+
+    Raises InputError for a missing log, and if there are none.
+    """
     logs = logs_among([arguments.log])
     if len(logs) > 1 and (arguments.start or arguments.end is not None):
         raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
@@ -189,7 +193,13 @@ def _parts(arguments: argparse.Namespace, damages: list[LogDamage]) -> list[tupl
         frames = frames.between(*log_section(log, frames, arguments.start, arguments.end))
         if log_suffix(log) == ".mcap" and not arguments.all:
             frames = frames[frames.channel & TRANSMITTED == 0]
-        parts.append((log, frames))
+        sendable = frames.identifier & ERR_FLAG == 0  # no host can send an error frame
+        if channels > 1:
+            sendable &= frames.bus < channels
+        summary.skipped += int((~sendable).sum())
+        parts.append((log, frames[sendable]))
+    if not any(len(frames) for _, frames in parts):
+        raise InputError(f"{arguments.log}: no frames to send in the chosen part")
     return parts
 
 
@@ -205,36 +215,15 @@ def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | 
     return first_ns + round(start_s * 1e9), None if end_s is None else first_ns + round(end_s * 1e9)
 
 
-def _sendable(frames: FrameColumns, channels: int) -> FrameColumns:
-    """Leave out error frames, which no host can send, and frames of further channels."""
-    sendable = frames.identifier & ERR_FLAG == 0
-    return frames[sendable if channels == 1 else sendable & (frames.bus < channels)]
-
-
-def _by_channel(senders: list[Send]) -> Send:
-    if len(senders) == 1:
-        return senders[0]
-    return lambda frame: senders[frame[3] & ~TRANSMITTED](frame)
-
-
-def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
+def _open_bus(interface: str, name: str) -> can.BusABC:
     from gz_onboard.bus._can import can, check_interface, open_bus
     from gz_onboard.bus.channel import NO_SOCKETS
 
     check_interface(interface)
-    if not names:
-        raise InputError("--channel: no channel is named")
-    buses: list[can.BusABC] = []
     options = {"fd": True} if interface == "socketcan" else {}
-    for name in names:
-        try:
-            buses.append(open_bus(interface, name, **options))
-        except (OSError, can.CanError, ImportError, ValueError) as error:
-            for bus in buses:
-                bus.shutdown()
-            there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
-            why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
-            raise InputError(
-                f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
-            ) from None
-    return buses
+    try:
+        return open_bus(interface, name, **options)
+    except (OSError, can.CanError, ImportError, ValueError) as error:
+        there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
+        why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
+        raise InputError(f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}") from None

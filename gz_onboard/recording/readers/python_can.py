@@ -189,12 +189,12 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
     )
 
 
-def message_of(frame: Frame, *, with_time: bool = True) -> can.Message:
+def message_of(frame: Frame) -> can.Message:
     """A frame as a python-can message, the inverse of `frame_of`; more than 8 bytes make it a CAN FD frame."""
     time_ns, identifier, data, channel = frame
     remote = bool(identifier & RTR_FLAG)
     return can.Message(
-        timestamp=time_ns / 1_000_000_000 if with_time else 0.0,
+        timestamp=time_ns / 1_000_000_000,
         arbitration_id=identifier & MOST_EXTENDED,
         is_extended_id=bool(identifier & EFF_FLAG),
         is_remote_frame=remote,
