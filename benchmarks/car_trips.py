@@ -97,11 +97,10 @@ def judge(file: Path, vehicle_file: Path) -> Trip:
 
     def observe(e: Estimate) -> None:
         distrusted.update(e.distrusted)
-        filter_ = pipeline.estimator.filter
-        if filter_ is None or e.soc is None:
+        if e.soc is None:
             return
         i = min(bisect_left(car.time, e.time), len(car.time) - 1)
-        errors.append((filter_.soc - car.soc[i], e.soc - car.shown[i], e.time))
+        errors.append((pipeline.estimator.pack.state.soc - car.soc[i], e.soc - car.shown[i], e.time))
         if e.time >= car.time[row] and not seen and e.range is not None:
             seen.append(e)
 

@@ -68,8 +68,9 @@ def errors(work: tuple[Path, Path, str, float]) -> tuple[Array, Array, Array]:
     for k, (time, current, volts, _) in enumerate(rows.tolist()):
         estimator.handle((time, 0, (TESTS[test],)))
         estimator.handle((time, 1, (volts, current)))
-        if (f := estimator.filter) is None:
+        if not estimator.pack.is_started:
             continue
+        f = estimator.pack.state
         if not told:
             told = True
             f = with_soc(f, float(truth[k]) + wrong, max(abs(wrong), RIGHT_SD) ** 2)._replace(v1=0.0, error=0.0)

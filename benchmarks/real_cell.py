@@ -251,7 +251,7 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
         effects.slow_resistance, effects.slow_time = setting.slow
     estimator.forecaster._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
-    cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator._load
+    cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.load
     power_of_prior = load.power_of_prior
     load.power_of_prior = lambda now: power_of_prior(now) / cells  # type: ignore[method-assign]
     return estimator
@@ -267,8 +267,8 @@ def run(setting: Setting, cycle: Cycle, case: Case) -> Score:
     for k, (v, i, t) in enumerate(zip(cycle.voltage, current, cycle.cell, strict=True)):
         estimator.handle((1.0 + k, 0, (t,)))
         estimator.handle((1.0 + k, 1, (v, i)))
-        f = estimator.filter
-        if f is None:
+        f = estimator.pack.state
+        if not estimator.pack.is_started:
             continue
         if not told:
             told = True

@@ -232,15 +232,13 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
     with Scene(bus, state_file=file) as scene:
         scene.ride(2.0)
     assert "going on" not in caplog.text
-    before = scene.daemon.pipeline.estimator.filter
-    assert before is not None
+    before = scene.daemon.pipeline.estimator.pack.state
     saved = state_of(file)
     with Scene(bus, state_file=file) as scene:
         estimator = scene.daemon.pipeline.estimator
-        scene.ride(10.0, lambda: estimator.filter is not None)  # it waits for an odometer that does not come
+        scene.ride(10.0, lambda: estimator.pack.is_started)  # it waits for an odometer that does not come
         assert "continuing from the state saved" in caplog.text
-        after = estimator.filter
-    assert after is not None
+        after = estimator.pack.state
     assert after.soc == pytest.approx(before.soc, abs=1e-3)
     assert state_of(file)["saved_at"] > saved["saved_at"]  # type: ignore[operator]
 

@@ -66,11 +66,11 @@ def test_on_board(amperes: float) -> None:
         e.handle((t, 1, (0.0,)))
         volts = shown(amperes) + P["pack_voltage_offset"] + 1e-3 * (step % 2)
         e.handle((t + 0.01, 0, (volts, amperes * P["pack_current_gain"] + P["pack_current_offset"])))
-        if e.filter:
+        if e.pack.is_started:
             break
-    assert e.filter is not None
-    sd = e.filter.covariance[0] ** 0.5
-    assert e.filter.soc == pytest.approx(SOC, abs=5e-3 if abs(amperes) < 1.5 else 1.5 * sd)
+    assert e.pack.is_started
+    sd = e.pack.state.covariance[0] ** 0.5
+    assert e.pack.state.soc == pytest.approx(SOC, abs=5e-3 if abs(amperes) < 1.5 else 1.5 * sd)
     assert sd < 0.08
 
 

@@ -104,8 +104,8 @@ def test_the_filter_reckons_with_it():
         for k in range(300):
             estimator.handle((float(k), 0, (0.0,)))
             estimator.handle((k + 0.1, 1, (volts, offset[1])))
-        assert estimator.filter
-        soc[battery is COLD] = estimator.filter.soc
+        assert estimator.pack.is_started
+        soc[battery is COLD] = estimator.pack.state.soc
     assert soc[True] == pytest.approx(0.6, abs=1e-6)
     assert soc[False] < 0.6 - 0.5 * 0.02 / COLD.ocv(0.6)[1]
 
@@ -119,9 +119,9 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
         for time in (1.0, 2.0):
             estimator.handle((time, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
         estimator.close()
-        assert estimator.filter
+        assert estimator.pack.is_started
         expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
-        assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)
+        assert estimator.pack.state.soc == pytest.approx(expected, abs=1e-3)
         sd[battery is COLD] = estimator.pack.voltage_noise.rest
     assert sd[True] > 1.01 * sd[False]
 
@@ -212,6 +212,6 @@ def test_a_wrong_start_is_left_by_less_where_errors_stay_longer(tmp_path):
             estimator.handle((k - 0.1, 0, (-10.0,)))
             load = 20.0 if k % 20 < 10 else 2.0  # no rest
             estimator.handle((float(k), 1, (volts - 0.05 * load, load)))
-        assert estimator.filter
-        sd[name] = estimator.filter.covariance[0] ** 0.5
+        assert estimator.pack.is_started
+        sd[name] = estimator.pack.state.covariance[0] ** 0.5
     assert sd["long"] > 1.02 * sd["usual"]

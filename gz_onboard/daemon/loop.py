@@ -131,7 +131,7 @@ class Daemon:
         if self._keeper:
             self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
         if self._rider:  # not the one of the saved state
-            self.pipeline.estimator.ridden_by(self._rider)
+            self.pipeline.estimator.forecaster.ridden_by(self._rider)
         return snapshot
 
     def tick(self) -> int:
@@ -145,7 +145,7 @@ class Daemon:
         offset = _wall_offset()
         now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
         now_ns = max(min([now_ns, *read_until]), now_ns - HELD_NS)
-        self.pipeline.estimator.wait((boot_ns - self._boot_ns) * 1e-9)
+        self.pipeline.estimator.pack.wait((boot_ns - self._boot_ns) * 1e-9)
         self._boot_ns = boot_ns
         # Frames that came while we read wait for the next tick: some of a channel that was read earlier are missing.
         frames.sort(key=itemgetter(0))

@@ -13,7 +13,7 @@ from math import inf, sqrt
 from typing import Any
 
 from gz_onboard.estimator import battery_pack, forecast, pack_age, weakest
-from gz_onboard.estimator.battery_filter import SCALAR, Backend, FilterState
+from gz_onboard.estimator.battery_filter import SCALAR, Backend
 from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.cells import Temperatures
 from gz_onboard.estimator.explanation import RangeExplainer
@@ -93,22 +93,9 @@ class Estimator:
         self.forecaster = Forecaster(model, battery, riding, self.pack)
         self.explainer = RangeExplainer(self.forecaster)
         self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
-        self._load = PresentLoad(
+        self.load = PresentLoad(
             self.forecaster.load, self.motion, self._temperatures, self.pack, self._vibration, self.signals
         )
-
-    @property
-    def filter(self) -> FilterState | None:
-        """State of the battery filter; None before the first voltage."""
-        return self.pack.state if self.pack.is_started else None
-
-    def vibration(self, now: float) -> float:
-        """Return the ``vibration`` that effects read [m/s²] at `now` [s]: a typical value while it is unknown."""
-        return self._load.vibration(now)
-
-    def ridden_by(self, rider: str) -> None:
-        """Switch to the habits of `rider`."""
-        self.forecaster.ridden_by(rider)
 
     # --- one step ---------------------------------------------------------------------------------------------
 
@@ -117,16 +104,13 @@ class Estimator:
         if not windows:
             return
         now = max(self._time or 0.0, *(window.time for window in windows))
-        self.signals.take(windows, now)
-        self._advance(now)
-
-    def _advance(self, now: float) -> None:
+        signals, motion = self.signals, self.motion
+        signals.take(windows, now)
         dt = self._elapsed(now)
         if dt is None:
             return
         self._time = now
-        signals, motion = self.signals, self.motion
-        elapsed = min(dt, self.signals.pause)
+        elapsed = min(dt, signals.pause)
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
@@ -135,12 +119,12 @@ class Estimator:
         motion.step(now, elapsed)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed, gap=elapsed < dt)
-        temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= self.signals.pause else None)
+        temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= signals.pause else None)
         self.pack.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
-        self.pack.step(now, dt, self._reading, temperature, motion.speed, self._load)
+        self.pack.step(now, dt, self._reading, temperature, motion.speed, self.load)
         self._follow_activity(now, dt)
         self._ride(now, dt)
-        if self.filter is None:
+        if not self.pack.is_started:
             self.forecaster.outdate()
         elif self.forecaster.due(now):
             self._look_ahead(now, temperature)
@@ -176,7 +160,7 @@ class Estimator:
         rides = speed is not None and abs(speed) > MOVING and dt < self.signals.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.pack.rest_voltage
-            return reading._replace(current=self._load.power(now) / voltage, source=CurrentSource.MODEL)
+            return reading._replace(current=self.load.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _cell_error(self, voltage: float, current: float, sensor: str) -> float:
@@ -185,10 +169,10 @@ class Estimator:
 
     def _road_power(self) -> float | None:
         known = self.motion.speed is not None and self.signals.sampled <= TIMING.coarse
-        return self._load.power(self._time or 0.0) if known else None
+        return self.load.power(self._time or 0.0) if known else None
 
     def _level_power(self, speed: float, acceleration: float) -> float:
-        return self._load.power_at(self._time or 0.0, speed, acceleration)
+        return self.load.power_at(self._time or 0.0, speed, acceleration)
 
     def _compare_grades(self, now: float, dt: float, gap: bool) -> None:
         """Compare the sensors of the grade; forget everything learned from a sensor that is newly distrusted."""
@@ -225,7 +209,7 @@ class Estimator:
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.motion.speed or 0.0) < MOTION.standstill:
-            self.ridden_by(f"{rider:g}")
+            self.forecaster.ridden_by(f"{rider:g}")
         speed = 0.0 if signals.carried else self.motion.speed
         self._activity.step(dt, speed, rate, signals.charge_plug.get(now), silent, off, drive)
         auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
@@ -249,7 +233,7 @@ class Estimator:
             speed,
             self.motion.grade,
             power,
-            self._load.conditions(now),
+            self.load.conditions(now),
             next((self.signals[role].period for role in self.signals.mapped(SPEEDS)), 0.0),
             self._drive(now, reading.voltage, power),
         )
@@ -269,7 +253,7 @@ class Estimator:
         cells = temperature, self._temperatures.cells_sd(now)
         missing = self._reasons(now) | int(self.signals.lacking)
         lost = sum([variance for reason, variance in _LOSS_VARIANCES if reason & missing])
-        conditions = self._load.conditions(now)
+        conditions = self.load.conditions(now)
         soc = self.pack.soc
         activity, way = self._activity.now, (self.motion.distance, self.route.hills)
         forecast = self.forecaster.step(
@@ -282,7 +266,7 @@ class Estimator:
 
     def estimate(self, now: float) -> Estimate:
         """Return the estimate at `now` [s]; cheap, and changes nothing."""
-        motion, filter_ = self.motion, self.filter
+        motion = self.motion
         reasons = self._reasons(now)
         estimate = Estimate(time=now, reasons=Reason(reasons), distrusted=self._distrusted, distance=motion.distance)
         silent = self._time is None or now - self._time > max(SILENT_AFTER, self.signals.pause)
@@ -295,11 +279,11 @@ class Estimator:
             estimate.current_modelled = reading.source is CurrentSource.MODEL
             estimate.innovation = self.pack.test.innovation
         estimate.cell_temperature = self._temperatures.cells
-        if filter_ is None:
+        if not self.pack.is_started:
             estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
             return estimate
         estimate.soc, estimate.soc_sd = self.pack.battery.window.shown(*self.pack.soc)
-        estimate.v1, estimate.innovation_rms = filter_.v1, sqrt(self.pack.test.square)
+        estimate.v1, estimate.innovation_rms = self.pack.state.v1, sqrt(self.pack.test.square)
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self.forecaster.report(estimate)
@@ -332,7 +316,7 @@ class Estimator:
 
     def snapshot(self, key: str) -> dict[str, Any] | None:
         """Return the state to save for the vehicle `key`; None before there is any."""
-        if self.filter is None:
+        if not self.pack.is_started:
             return None
         return self.pack.snapshot() | {
             "version": VERSION,
@@ -347,10 +331,6 @@ class Estimator:
     def learned_snapshot(self) -> dict[str, Any]:
         """Return the learned age of the pack, a part of the saved state."""
         return self.pack.learned_snapshot()
-
-    def wait(self, seconds: float) -> None:
-        """Age the restored state by `seconds` [s] in which no voltage has come."""
-        self.pack.wait(seconds)
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Continue from a snapshot that is `age` [s] old (None: not known).

@@ -38,20 +38,6 @@ HEADINGS = tuple(pi / 4 * i for i in range(8))
 USUAL_AIR = MILD, 0.0  # degC, m: of the usual force
 AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled for each degC and each 100 m
 KEPT_AIRS = 8  # for which it is kept: a sensor at the edge of two goes to and fro
-BASE = {
-    "speed",
-    "acceleration",
-    "grade",
-    "grade_cosine",
-    "headwind",
-    "mass",
-    "air_density",
-    "motor_temperature",
-    "motor_speed",
-    "motor_current",
-    "torque",
-}
-"""Quantities that need nothing beyond speed, grade and air."""
 
 
 class Conditions(NamedTuple):
@@ -79,9 +65,8 @@ class Ledger:
 class LoadModel:
     """Forward model of one vehicle with the inputs that are typical for it.
 
-    extended: the road load reads more than `BASE`; ledger: kept of the riding if there is one, which on board there is
-    not; states: of effects with memory between road and pack; time_moving: since the start or the last
-    long standstill [s].
+    ledger: kept of the riding if there is one, which on board there is not; states: of effects with memory between road
+    and pack; time_moving: since the start or the last long standstill [s].
     """
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
@@ -93,7 +78,6 @@ class LoadModel:
         road = [effect for effect in model.effects if effect.port is not Port.CELL_VOLTAGE]
         reads = frozenset[str]().union(*(effect.reads for effect in road))
         memory = any(effect.decay for effect in road)
-        self.extended = memory or not reads <= BASE
         self._repeats = not memory and not reads & {"heading", "time_moving"}  # riding it again takes the same
         self._by_heading = "heading" in reads
         self._battery = battery
@@ -104,6 +88,8 @@ class LoadModel:
     ) -> Quantities:
         """Inputs of the model at `speed` [m/s], `acceleration` [m/s²], `grade` (sine), `time_moving` [s]."""
         c, prior = conditions, self.prior
+        lateral, vibration = c.lateral_acceleration, c.vibration
+        cells = c.ambient if c.cell_temperature is None else c.cell_temperature
         q = {
             "speed": speed,
             "acceleration": acceleration,
@@ -113,22 +99,17 @@ class LoadModel:
             "mass": self.model.mass,
             "air_density": air_density(c.ambient, c.altitude),
             "motor_temperature": c.motor_temperature,
+            "lateral_acceleration": prior.lateral_acceleration * (speed > MOVING) if lateral is None else lateral,
+            "vibration": prior.vibration * (speed > MOVING) if vibration is None else vibration,
+            "time_moving": time_moving,
+            "ambient_temperature": c.ambient,
+            "soc": c.soc,
+            "cell_temperature": cells,
+            "cell_current": c.current / self._battery.cells_parallel,
+            "cell_capacity": self._battery.cell_capacity(cells),
         }
-        if self.extended:
-            lateral, vibration = c.lateral_acceleration, c.vibration
-            cells = c.ambient if c.cell_temperature is None else c.cell_temperature
-            q |= {
-                "lateral_acceleration": prior.lateral_acceleration * (speed > MOVING) if lateral is None else lateral,
-                "vibration": prior.vibration * (speed > MOVING) if vibration is None else vibration,
-                "time_moving": time_moving,
-                "ambient_temperature": c.ambient,
-                "soc": c.soc,
-                "cell_temperature": cells,
-                "cell_current": c.current / self._battery.cells_parallel,
-                "cell_capacity": self._battery.cell_capacity(cells),
-            }
-            if c.heading is not None:
-                q["heading"] = c.heading
+        if c.heading is not None:
+            q["heading"] = c.heading
         return q
 
     def powers(self, q: Quantities, recall: Recall | None = None) -> dict[str, float]:
@@ -193,13 +174,10 @@ class PresentLoad:
     def conditions(self, now: float) -> Conditions:
         """Conditions of the riding, as far as they are known."""
         motion, motor = self._motion, self._motor_temperature.get(now)
-        ambient, altitude = self._temperatures.ambient(now), motion.altitude or 0.0
-        if not self._load.extended:
-            return Conditions(ambient, altitude, WARM_MOTOR if motor is None else motor)
         turning = motion.yaw_rate is not None and motion.speed is not None
         return Conditions(
-            ambient,
-            altitude,
+            self._temperatures.ambient(now),
+            motion.altitude or 0.0,
             WARM_MOTOR if motor is None else motor,
             (motion.speed or 0.0) * (motion.yaw_rate or 0.0) if turning else None,
             motion.heading,
@@ -227,8 +205,7 @@ class PresentLoad:
 
     def cell_inputs(self, now: float) -> dict[str, float]:
         """Inputs of effects in the cells, apart from those of the cells themselves."""
-        inputs = {"time_moving": self._load.time_moving}
-        return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
+        return {"time_moving": self._load.time_moving, "vibration": self.vibration(now)}
 
     def vibration(self, now: float) -> float:
         """Vibration that effects read [m/s²]: the typical value while it is not known."""

@@ -113,7 +113,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
 
     def observe(estimate: Estimate) -> None:
         if went_on:  # as the daemon has it: until a voltage comes, what was restored grows older
-            pipeline.estimator.wait(estimate.time - (tally.last.time if tally.last else 0.0))
+            pipeline.estimator.pack.wait(estimate.time - (tally.last.time if tally.last else 0.0))
         tally(estimate)
         tally.gauge.take(estimate, own.last)
 

@@ -66,7 +66,7 @@ def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
             raise _refused(at.file, copy, error) from error
         began = WentOn(True, age, digest_of(copy))
     if at.rider:
-        pipeline.estimator.ridden_by(at.rider)
+        pipeline.estimator.forecaster.ridden_by(at.rider)
     return began
 
 

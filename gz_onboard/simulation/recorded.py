@@ -121,7 +121,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         if motion.heading is not None and speed > _MOVING:
             headings.append((motion.distance, motion.heading))
         if reads_vibration:
-            rough.append((estimate.time, motion.distance, pipeline.estimator.vibration(estimate.time)))
+            rough.append((estimate.time, motion.distance, pipeline.estimator.load.vibration(estimate.time)))
 
     mapping, frames = open_ride(log, vehicle)
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)

@@ -127,7 +127,7 @@ def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[floa
 
 def set_soc(e: Any, soc: float, variance: float, error_variance: float) -> None:
     """Set the state of charge and the variances of it and of the model error [V²]."""
-    state = with_soc(e.filter, soc, variance)
+    state = with_soc(e.pack.state, soc, variance)
     covariance = (variance, 0.0, 0.0, 0.0, error_variance, 0.0, 0.0, *state.covariance[7:])
     e.pack.state = state._replace(covariance=covariance)
     e.pack.age.apply(e.pack.state)
@@ -136,7 +136,7 @@ def set_soc(e: Any, soc: float, variance: float, error_variance: float) -> None:
 def knows(e: Any, scooter: Scooter) -> None:
     """Tell it the true state of charge and capacity: what it says from then on is by what it has counted."""
     set_soc(e, scooter.soc, 1e-8, 1e-8)
-    state = e.filter
+    state = e.pack.state
     covariance = (*state.covariance[:7], 1e-6, *state.covariance[8:])
     e.pack.state = state._replace(inverse_capacity=1.0, covariance=covariance)
     e.pack.age.apply(e.pack.state)

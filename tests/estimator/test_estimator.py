@@ -109,8 +109,8 @@ def test_finds_back_from_a_wrong_start():
     """20 % wrong and unaware of it by half: half an hour of riding brings it back."""
     plant = Plant(soc=0.7, offset=0.0)
     estimator, _ = run(plant, 2)
-    assert estimator.filter
-    estimator.pack.state = with_soc(estimator.filter, estimator.filter.soc - 0.2, 0.1**2)
+    assert estimator.pack.is_started
+    estimator.pack.state = with_soc(estimator.pack.state, estimator.pack.state.soc - 0.2, 0.1**2)
     _, rows = run(plant, 1800, estimator, begin=2.0)
     assert abs(rows[-1][1].soc - rows[-1][0]) < 0.05
 

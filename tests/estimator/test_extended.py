@@ -241,13 +241,6 @@ def expected(f):
     return f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0).consumption
 
 
-def test_the_base_model_asks_for_nothing_more():
-    assert not forecaster(BASE).load.extended
-    assert not forecaster(extended("dragging_brake", "drivetrain_drag", "regen_loss")).load.extended
-    for name in ("cornering_drag", "headwind", "tyre_warm_up"):
-        assert forecaster(extended(name)).load.extended
-
-
 def test_of_bends_those_ridden_count():
     vehicle = extended("cornering_drag")
     straight, winding = (ride(forecaster(vehicle), vehicle.model, 6, radius=r) for r in (0.0, 40.0))

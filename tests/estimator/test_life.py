@@ -221,9 +221,9 @@ def test_after_a_load_a_short_stop_proves_nothing():
     scooter.speed = 0.0
     e = estimator()
     follow(e, scooter.live(20, 11.0), scooter)
-    before = e.filter.covariance[0]
+    before = e.pack.state.covariance[0]
     rows = follow(e, scooter.live(40), scooter)
-    assert e.filter.covariance[0] > 0.5 * before
+    assert e.pack.state.covariance[0] > 0.5 * before
     assert worst(rows) < 3
 
 
@@ -517,7 +517,7 @@ def test_the_wait_for_a_first_voltage_counts_as_age(told):
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, heard(scooter.live(400, 10.0), own_soc=told, odometer=told), scooter)
     waited, aged, young = restarted(e, 3.0), restarted(e, 60.0), restarted(e, 3.0)
-    waited.wait(57.0)
+    waited.pack.wait(57.0)
     scooter.away(60, 10.0)
     events = list(heard(scooter.live(3, 10.0), own_soc=told, odometer=told))
     sds = []
@@ -619,7 +619,7 @@ def test_a_state_of_charge_begun_anew_ends_what_was_held_back_of_the_range():
     follow(e, scooter.live(1, 10.0), scooter)
     assert smoother.gap > 3000
     scooter.soc = 0.3
-    e.pack.state = e.filter._replace(soc=0.3)
+    e.pack.state = e.pack.state._replace(soc=0.3)
     follow(e, scooter.live(2, 10.0), scooter)
     assert abs(smoother.gap) < 300
 

@@ -127,7 +127,7 @@ def started(voltage, seconds: float):
     for step in range(round(seconds * 10) + 1):
         e.handle((step / 10, 0, (voltage(step / 10), 0.0)))
         e.handle((step / 10, 1, (0.0,)))
-        if e.filter:
+        if e.pack.is_started:
             return step / 10, e
     return None, e
 
@@ -141,7 +141,7 @@ def test_the_first_voltage_is_waited_for():
     assert now == pytest.approx(PACK.resettled_s + 1.0, abs=2 * WINDOW)
     now, e = started(lambda t: 50.0 + 4 * (t // WINDOW % 2), 100.0)
     assert now == pytest.approx(PACK.longest_wait_s, abs=2 * WINDOW)
-    assert e.filter.covariance[0] ** 0.5 > 0.25  # nothing is known of it
+    assert e.pack.state.covariance[0] ** 0.5 > 0.25  # nothing is known of it
 
 
 def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():

@@ -145,7 +145,7 @@ def test_what_flowed_in_a_pause_is_covered(gap, speed):
     scooter.away(gap, speed)
     e.handle(next(scooter.live(0.1, speed)))
     e.close()
-    assert abs(e.filter.soc - scooter.soc) < 2 * e.filter.covariance[0] ** 0.5
+    assert abs(e.pack.state.soc - scooter.soc) < 2 * e.pack.state.covariance[0] ** 0.5
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.2])

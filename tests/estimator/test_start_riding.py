@@ -40,8 +40,8 @@ def test_at_full_speed_the_polarisation_is_that_of_full_speed():
         e.handle((i * 0.1, 2, (20.0,)))
         e.handle((i * 0.1 + 0.01, 1, (speed,)))
         e.handle((i * 0.1 + 0.02, 0, (current, power / current)))
-    assert e.filter is not None
-    assert e.filter.soc == pytest.approx(soc, abs=0.04)
+    assert e.pack.is_started
+    assert e.pack.state.soc == pytest.approx(soc, abs=0.04)
 
 
 @pytest.mark.parametrize("guess", [0.0, 0.6])

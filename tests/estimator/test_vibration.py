@@ -165,7 +165,7 @@ def quiet(rough):
 def test_the_road_load_is_that_of_the_shaking(rough, quiet):
     for vibration in (1.0, 2.5):
         e = estimated(rough, events(240, vibration))
-        assert e.vibration(240.0 - 0.01) == pytest.approx(vibration, rel=0.15)
+        assert e.load.vibration(240.0 - 0.01) == pytest.approx(vibration, rel=0.15)
         (energy, way), (base, same) = modelled(e), modelled(quiet)
         assert way == same
         # and what the motor loses for it
@@ -193,7 +193,7 @@ def test_lost_midway_it_goes_over_to_the_typical_and_back(rough):
     e, seen = estimated(rough, []), {}
     for event in events(120, 2.5, lambda t: 50 < t < 70):
         e.handle(event)
-        seen[round(event[0])] = e.vibration(event[0])
+        seen[round(event[0])] = e.load.vibration(event[0])
     assert seen[49] == pytest.approx(2.5, rel=0.2)
     assert seen[60] in (TYPICAL, 0.0)
     assert seen[74] in (TYPICAL, 0.0)
@@ -228,11 +228,11 @@ def test_what_was_learned_outlives_a_restart(rough):
     assert second.snapshot(rough.key) is None  # it waits for a voltage
     waited = {"still": first.forecaster.learner.still + 5.0}
     assert second.forecaster.snapshot() == first.forecaster.snapshot() | waited
-    assert second.vibration(240.0) == 0.0  # standing, and nothing is known of the road
+    assert second.load.vibration(240.0) == 0.0  # standing, and nothing is known of the road
     at = (0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
     mended = first.forecaster
     mended.learner._segment = mended.learner._segment.__class__()  # a restart drops the open segment
-    first.pack.age.apply(first.filter)  # and uses at once what else is only used now and then
+    first.pack.age.apply(first.pack.state)  # and uses at once what else is only used now and then
     assert second.forecaster.forecast(*at) == mended.forecast(*at)
     with pytest.raises(ValueError, match="rough_road"):
         estimated(BASE, []).restore(saved, BASE.key, 5.0)
@@ -258,7 +258,7 @@ def test_simulated_frames_tell_it(rough):
     drive(scooter, trace.watch(along([8.0] * 2000)), 140.0)
     frames = [frame for batch in batches(simulate_frames(rough, trace.truth(scooter), 3)) for frame in batch]
     whole, base = ridden(frames, rough), ridden(frames, BASE)
-    assert whole.pipeline.estimator.vibration(whole.estimates[-1].time) == pytest.approx(2.2, rel=0.2)
+    assert whole.pipeline.estimator.load.vibration(whole.estimates[-1].time) == pytest.approx(2.2, rel=0.2)
     now, without = (run.pipeline.estimator.forecaster.learner.state.recent for run in (whole, base))
     assert now.measured / now.modelled == pytest.approx(1.0, abs=0.1)
     assert without.measured / without.modelled > 1.1

@@ -224,7 +224,7 @@ def test_a_charge_or_a_new_state_of_charge_begins_another_block():
     charged = False
     for event in heard(WEAK):
         if len(blocks) == 3 and estimator.pack.weakest._block.count > 3 and not charged:
-            charged, estimator.pack.state = True, estimator.filter._replace(soc=estimator.filter.soc + 0.2)
+            charged, estimator.pack.state = True, estimator.pack.state._replace(soc=estimator.pack.state.soc + 0.2)
         estimator.handle(event)
         if len(blocks) == 6:
             break

@@ -95,7 +95,7 @@ def by_the_daemon(frames: list[Frame], file: Path, monkeypatch: pytest.MonkeyPat
     for until in [*range(times[0], times[-1], TICK_NS)[1:], times[-1]]:
         end = bisect_left(times, until + (until == times[-1]))
         daemon.step(frames[done:end], until)
-        daemon.pipeline.estimator.wait(TICK_NS * 1e-9)
+        daemon.pipeline.estimator.pack.wait(TICK_NS * 1e-9)
         now[0], done = until, end
     assert daemon._keeper
     assert daemon._keeper._thread.wait(60)
