@@ -38,7 +38,6 @@ from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery, Health
 from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.functions import relaxed
 from gz_onboard.physics.model import STOOD, Model, standing_load
 
 
@@ -376,7 +375,7 @@ class BatteryPack:
         """Predict the state over `dt` [s] at a mean pack `current` [A]; variance: of SOC, by counting."""
         battery, state, cell = self.battery, self.state, self._cell
         decay = exp(-dt / cell.time)
-        v1 = relaxed(state.v1, cell.r1 * current / battery.cells_parallel, decay)
+        v1 = decay * state.v1 + (1 - decay) * (cell.r1 * current / battery.cells_parallel)
         error, time = self._slow = self.voltage_noise.slow(state.soc, cell.slope, temperature, state.covariance[0])
         # An error beyond the model's own is an overpotential of before, and decays as that does.
         error_decay = decay if state.covariance[4] > error else exp(-dt / time)

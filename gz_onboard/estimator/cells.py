@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import exp
 from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
@@ -11,7 +12,6 @@ from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import pack_constants
 from gz_onboard.physics.effect import QUANTITIES, Port
-from gz_onboard.physics.functions import decay_over, relaxed
 from gz_onboard.physics.model import Model, share_that_ages
 from gz_onboard.physics.parameters import Parameters
 
@@ -153,7 +153,8 @@ class Temperatures:
         before = measured if measured is not None else ambient + self._above_air if self.cells is None else self.cells
         above = self._above_air if measured is not None else before - ambient
         watts = heat(before) if heat else 0.0
-        above = relaxed(above, watts / self._conductance, decay_over(dt, self._cooling_time))
+        decay = exp(-dt / self._cooling_time)
+        above = decay * above + (1 - decay) * (watts / self._conductance)
         if measured is not None:
             self.cells, self._above_air = measured, above if air is None else measured - air
             return measured

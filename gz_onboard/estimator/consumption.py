@@ -371,11 +371,6 @@ class ConsumptionLearner:
         """Measured over modelled energy of the present riding."""
         return self.factor + self.auxiliary_factor
 
-    @property
-    def price_known(self) -> float:
-        """How much of the expected price the riding has taught, rather than the prior: 0 to 1."""
-        return min(max(1 - self.habits.price.variance / self.prior.price.variance, 0.0), 1.0)
-
     def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
         """The riding on the next `way` [m]; ambient in degC, altitude in m."""
         c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed

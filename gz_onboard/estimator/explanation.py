@@ -250,7 +250,8 @@ class RangeExplainer:
         """Parts of the riding lately ridden, and of the prior riding as far as that is still expected."""
         learner, unit = self._forecaster.learner, sum(self._load.prior_prices(*USUAL_AIR))
         sums = learner.state.sums
-        share = learner.price_known * sums.distance / (sums.distance + CONFIG.riding_m)
+        learned = min(max(1 - learner.habits.price.variance / learner.prior.price.variance, 0.0), 1.0)
+        share = learned * sums.distance / (sums.distance + CONFIG.riding_m)
         if not (share and sums.prior and sums.speed_squares):
             return self._prior_parts
         speed, grade, lateral = (

@@ -24,7 +24,6 @@ from gz_onboard.offline.sensors import road_speed
 from gz_onboard.offline.series import all_quantities, ocv_over, over, reversible_heat_over, stepper, total
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
-from gz_onboard.physics.functions import relaxed
 from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
@@ -111,7 +110,7 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         q["cell_capacity"] = battery.cell_capacity(celsius)
         volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + sum(effects(q)))
         result[i] = battery.pack_voltage(volts, amperes)
-        v1 = relaxed(v1, r1 * cell, decay)
+        v1 = decay * v1 + (1 - decay) * r1 * cell
         soc -= half
         q["soc"] = soc
         effects(q)

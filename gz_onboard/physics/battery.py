@@ -8,7 +8,7 @@ rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is 
 over SOC, the reversible heat of the reaction.
 
 Simulation, estimator, calibration, validation and discovery all call these equations, for floats and numpy arrays
-alike. The RC pair is the lag of `physics.functions`.
+alike.
 """
 
 from __future__ import annotations

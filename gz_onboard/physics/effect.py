@@ -194,10 +194,6 @@ class Equation:
         keywords = tuple(a.name for a in arguments if a.kind is a.KEYWORD_ONLY)
         return cls(function, tuple(a.name for a in arguments if a.kind is not a.KEYWORD_ONLY), keywords)
 
-    def __call__(self, *quantities: Any, **parameters: float) -> Any:
-        """The value."""
-        return self.function(*quantities, **parameters)
-
     def bound(self, values: Mapping[str, float]) -> Callable[..., Any]:
         """A function of quantities by name, and of ``dt`` [s] for a decay, with these `values` of the parameters."""
         call = partial(self.function, **{name: values[name] for name in self.parameters})
@@ -248,15 +244,10 @@ def effects_in(folder: Path) -> tuple[str, ...]:
 
 
 @cache
-def known_effects() -> tuple[str, ...]:
-    """The names of the package's effects."""
-    return effects_in(PACKAGE_EFFECTS)
-
-
-@cache
 def package_effects() -> dict[str, ModuleType]:
     """The modules of the package's effects, by name."""
-    return {name: importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects()}
+    names = effects_in(PACKAGE_EFFECTS)
+    return {name: importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in names}
 
 
 def effect_file(name: str, folder: Path | None) -> Path | None:
@@ -274,8 +265,8 @@ def load_effect(name: str, folder: Path | None = None) -> Effect:
             raise
         except BaseException as error:  # SystemExit too: a user's code does not end ours without a word
             raise failed(file, error) from error
-    if name not in known_effects():
-        known = [*known_effects(), *(effects_in(folder) if folder else ())]
+    if name not in package_effects():
+        known = [*package_effects(), *(effects_in(folder) if folder else ())]
         raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
     return _effect(name, package_effects()[name])
 

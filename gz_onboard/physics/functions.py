@@ -1,6 +1,6 @@
-"""Functions that effects, battery and controller are written with: elementary functions, the first-order lag, tables.
+"""Functions that effects, battery and controller are written with: elementary functions and tables.
 
-Elementary functions and the lag take floats and numpy arrays alike; numpy is imported only where an array comes. Tables
+Elementary functions take floats and numpy arrays alike; numpy is imported only where an array comes. Tables
 take floats; `offline.series` reads them for arrays. They are straight between their points. The circuit of a cell is
 geometric over temperature, straight in the logarithm: resistances fall nearly exponentially with it (Arrhenius), and a
 straight line between two temperatures is a tenth too high where they are 20 K apart.
@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any
 
-T = TypeVar("T")
 Row = tuple[float, ...]
 NUMBER = float, int  # a tuple: a union would be built again at each call, which takes longer than the function
 STANDSTILL = 0.1  # m/s, or rad/s of a shaft: below it friction fades, so that nothing jumps where the sign changes
@@ -47,21 +46,8 @@ def direction(speed: Any) -> Any:
     return speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
 
 
-# --- first-order lag, dx/dt = (target - x)/τ: an RC pair (target R·I: Lord 2016, eq. 2.22), an effect with memory ---
-
-
-def decay_over(dt: float, time_constant: float) -> float:
-    """The factor by which the distance from the target shrinks in `dt` [s]; `time_constant` in s."""
-    return math.exp(-dt / time_constant)
-
-
-def relaxed(x: T, target: T, decay: T) -> T:
-    """`x` after a step over which it decays by `decay` towards a constant `target`; exact."""
-    return decay * x + (1 - decay) * target  # type: ignore[operator,no-any-return]
-
-
 def mean_response(decay: float) -> float:
-    """The mean of a lag's response over a constant load, as a share of the settled value: 1 - τ/T·(1 - exp(-T/τ)).
+    """The mean response of a first-order lag to a constant load, over the settled value: 1 - τ/T·(1 - exp(-T/τ)).
 
     decay: exp(-T/τ), over the load's duration T.
     """

@@ -24,8 +24,8 @@ from gz_onboard.physics.effect import (
     VEHICLE_PARAMETERS,
     Effect,
     Parameter,
-    known_effects,
     load_effect,
+    package_effects,
 )
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ class Parameters(dict[str, float]):
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
     """Every parameter that a vehicle file may set: the vehicle's, the battery's, and those of all effects."""
-    own = [load_effect(name) for name in known_effects()]
+    own = [load_effect(name) for name in package_effects()]
     of_effects = [p for effect in (*own, *effects) for p in effect.parameters]
     return {p.name: p for p in (*VEHICLE_PARAMETERS, *BATTERY_PARAMETERS, *SIMULATION_PARAMETERS, *of_effects)}
 

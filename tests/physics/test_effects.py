@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from gz_onboard.errors import InputError
 from gz_onboard.offline.series import over, series
 from gz_onboard.offline.traits import traits
-from gz_onboard.physics.effect import QUANTITIES, Port, effects_in, known_effects, load_effect
+from gz_onboard.physics.effect import QUANTITIES, Port, effects_in, load_effect, package_effects
 from gz_onboard.physics.model import Bound, stepping
 from gz_onboard.physics.parameters import declared_parameters
 
-EFFECTS = [load_effect(name) for name in known_effects()]
+EFFECTS = [load_effect(name) for name in package_effects()]
 CONSERVATIVE = {"inertia", "grade_force", "headwind"}  # what they take they give back; the wind gives of its own
 LIMITS = {
     "speed": (-5, 40),
@@ -54,7 +54,7 @@ ALL = {name: st.floats(*LIMITS[name], allow_subnormal=False) for name in QUANTIT
 
 def call(effect, values, **replaced):
     keywords = {name: PRIORS[name] for name in effect.term.parameters} | replaced
-    return effect.term(*[values[name] for name in effect.term.quantities], **keywords)
+    return effect.term.function(*[values[name] for name in effect.term.quantities], **keywords)
 
 
 def test_the_limits_cover_every_quantity():
@@ -162,19 +162,19 @@ def test_an_effect_with_memory_starts_at_nothing():
 
 
 def test_headwind_is_the_difference_of_the_drag_and_goes_round_with_the_heading():
-    wind, drag = load_effect("headwind"), load_effect("aerodynamic_drag")
+    wind, drag = (load_effect(name).term.function for name in ("headwind", "aerodynamic_drag"))
     blow = {"drag_area": 0.5, "wind_north": 3.0, "wind_east": 0.0}
 
     def force(heading):
-        return wind.term(10.0, 0.0, heading, 1.2, **blow)
+        return wind(10.0, 0.0, heading, 1.2, **blow)
 
     def still(headwind):
-        return drag.term(10.0, headwind, 1.2, drag_area=0.5)
+        return drag(10.0, headwind, 1.2, drag_area=0.5)
 
     assert force(0.0) == pytest.approx(still(3.0) - still(0.0))  # to the north, from where it blows
     assert force(math.pi) == pytest.approx(still(-3.0) - still(0.0))
     assert force(math.pi / 2) == pytest.approx(0.0, abs=1e-9)
-    assert wind.term(10.0, 0.0, math.pi / 2, 1.2, **blow | {"wind_north": 0.0, "wind_east": 3.0}) == pytest.approx(
+    assert wind(10.0, 0.0, math.pi / 2, 1.2, **blow | {"wind_north": 0.0, "wind_east": 3.0}) == pytest.approx(
         force(0.0)
     )
 
@@ -211,7 +211,7 @@ def test_a_user_effect_is_one_file(tmp_path: Path):
         "    return test_force * speed\n"
     )
     effect = load_effect("cornering_test", tmp_path)
-    assert effect.term(3.0, test_force=2.0) == 6.0
+    assert effect.term.function(3.0, test_force=2.0) == 6.0
     assert effect.term.quantities == ("speed",)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.backward import RideConditions, backward
-from gz_onboard.physics.effect import Port, known_effects, load_effect
+from gz_onboard.physics.effect import Port, load_effect, package_effects
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
@@ -66,7 +66,7 @@ def ride(vehicle: Vehicle, seconds: float = 96.0, road: Any = bends, **options: 
 def test_the_candidates_are_all_effects_beyond_the_base():
     base = {effect.name for effect in BASE.model.effects}
     of_the_bench = {"charge_transfer"}  # pulses show it, rides do not
-    assert set(known_effects()) == base | set(CANDIDATES) | of_the_bench
+    assert set(package_effects()) == base | set(CANDIDATES) | of_the_bench
 
 
 def test_the_balance_closes_with_all_effects_and_parameters():

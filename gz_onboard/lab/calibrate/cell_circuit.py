@@ -18,7 +18,6 @@ from gz_onboard.arrays import Array
 from gz_onboard.offline.series import bilinear_over, extended_over, relaxation
 from gz_onboard.physics.battery import terminal_voltage
 from gz_onboard.physics.effects import charge_transfer
-from gz_onboard.physics.functions import relaxed
 
 *FOUND, REACTIONS = charge_transfer.PARAMETERS
 """Those that pulses show, and the number of reactions. Pulses alone would take more of them, and road profiles held out
@@ -107,7 +106,7 @@ def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
     x, y, xs, ys = 0.0, 0.0, [], []
     for a, d, i in zip(decay.tolist(), (decay * dt / tau).tolist(), current.tolist(), strict=True):
         y = a * y + d * (x - i)
-        x = relaxed(x, i, a)
+        x = a * x + (1 - a) * i
         xs.append(x)
         ys.append(y)
     return np.array(xs), np.array(ys)

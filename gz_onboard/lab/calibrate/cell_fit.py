@@ -23,7 +23,6 @@ from gz_onboard.constants import KELVIN
 from gz_onboard.lab.calibrate.cell_circuit import follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.offline.arrays import bends
-from gz_onboard.physics.functions import decay_over
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
 # of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.
@@ -233,7 +232,7 @@ class Reduction:
 
     def __init__(self, loads: Sequence[Array], count: int = 1, beside: tuple[float, float] | None = None) -> None:
         def filtered_by(tau: float) -> Array:
-            a = decay_over(1.0, tau)
+            a = np.exp(-1.0 / tau)
             return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))

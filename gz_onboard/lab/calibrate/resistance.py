@@ -23,7 +23,6 @@ from gz_onboard.offline.sensors import true_columns
 from gz_onboard.offline.series import first_soc
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.functions import decay_over
 from gz_onboard.physics.model import standing_load
 from gz_onboard.vehicle import Vehicle
 
@@ -153,7 +152,7 @@ def _ride_steps(
         charge = float(np.trapezoid(current, time))  # A·s; what half of it takes is the middle of the ride
         soc = start - discharged(charge, 0.5, battery.pack_capacity(temperature))
         r0, r1, c1 = battery.circuit(soc, temperature)
-        cell_ohm = r0 + r1 * (1 - decay_over(STEP_TIME / 2, r1 * c1))
+        cell_ohm = r0 + r1 * (1 - np.exp(-STEP_TIME / 2 / (r1 * c1)))
     else:
         low, high = by_temperature[0][[0, -1]]
         if not low <= temperature <= high:

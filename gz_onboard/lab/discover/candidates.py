@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.offline.traits import traits
-from gz_onboard.physics.effect import BASE_EFFECTS, Effect, Parameter, Port, effects_in, known_effects, load_effect
+from gz_onboard.physics.effect import BASE_EFFECTS, Effect, Parameter, Port, effects_in, load_effect, package_effects
 from gz_onboard.physics.parameters import declared_parameters
 
 
@@ -123,7 +123,7 @@ def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
     `folder`. Raises InputError for a file in `folder` that is no effect.
     """
     declared = declared_parameters()
-    own = [load_effect(name) for name in known_effects()]
+    own = [load_effect(name) for name in package_effects()]
     changes: list[tuple[Port | None, Candidate]] = [
         (effect.port, Candidate(known.cause[0], _strengths(effect), known.cause[1], known.shown_by))
         for effect, known in ((effect, traits(effect)) for effect in own)
@@ -132,7 +132,7 @@ def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
     for name, (place, parameter, equation, shown_by) in VEHICLE_CAUSES.items():
         changes.append((place, Candidate(name, (declared[parameter],), equation, shown_by)))
     found = [cause for _, cause in sorted(changes, key=lambda row: PLACES.index(row[0]))]
-    packaged = [name for name in known_effects() if name not in BASE_EFFECTS]
+    packaged = [name for name in package_effects() if name not in BASE_EFFECTS]
     theirs = [name for name in effects_in(folder) if name not in packaged] if folder else []
     for effect in (load_effect(name, folder) for name in (*packaged, *theirs)):
         if strengths := _strengths(effect):

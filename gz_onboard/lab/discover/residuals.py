@@ -23,7 +23,6 @@ from gz_onboard.offline.series import curve_over, first_soc, mesh_over, ocv_over
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.functions import decay_over, relaxed
 from gz_onboard.physics.model import drag_torque, standing_load
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
@@ -200,9 +199,9 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     decay = np.exp(-DT / (r1 * mesh_over(battery.c1, soc, temperature) * np.exp(p["pair_time"])))
     settled = r1 * (1 + p["pair_resistance"]) * factor * cell
     v1 = relaxation(settled, decay, p["v1_start"], before=True)
-    v1 = (v1 + relaxed(v1, settled, decay)) / 2  # the mean of the step's ends
+    v1 = (v1 + decay * v1 + (1 - decay) * settled) / 2  # the mean of the step's ends
     extra: Any = p["drift"] * np.arange(len(cell)) * DT / DRIFT_TIME
-    mid = relaxation(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
+    mid = relaxation(cell, np.full(len(cell), np.exp(-DT / MID)), before=True)
     extra = extra + p["mid_resistance"] * mid
     q = {name: block_means(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}

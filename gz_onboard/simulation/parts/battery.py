@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
+from math import exp
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, current_of
-from gz_onboard.physics.functions import decay_over
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
@@ -66,7 +66,7 @@ class FirstOrderPack:
         self._soc_before = soc
         self._r0, self._r1, self._c1 = battery.circuit(soc, temperature)
         self._q["cell_temperature"], self._q["cell_capacity"] = temperature, battery.cell_capacity(temperature)
-        self._decay, self._decay_dt = decay_over(dt, self._r1 * self._c1), dt
+        self._decay, self._decay_dt = exp(-dt / (self._r1 * self._c1)), dt
         self._capacity = battery.pack_capacity(temperature)
         self._shift = battery.rest_shift(temperature)
         self._age = 0.0

@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.prior import NUISANCE
 from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.traits import traits
-from gz_onboard.physics.effect import known_effects, load_effect
+from gz_onboard.physics.effect import load_effect, package_effects
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import LOGS
 
@@ -84,7 +84,7 @@ def test_steering_is_that_of_a_bicycle():
 
 def test_effects_say_of_themselves_how_a_cause_shows():
     found = {cause.name: cause for cause in candidates()}
-    for effect in map(load_effect, known_effects()):
+    for effect in map(load_effect, package_effects()):
         own = {parameter.name for parameter in effect.parameters}
         known = traits(effect)
         assert set(known.strengths) <= own

@@ -75,4 +75,4 @@ def test_a_constant_is_called_one_and_can_be_modelled(mixed: MixedModel, ride: S
     assert text is not None
     (tmp_path / f"{text[0]}.py").write_text(text[1])
     effect, scale = load_effect(text[0], tmp_path), {f"{text[0]}_scale": 1.0}
-    assert [effect.term(v, **scale) for v in (0.0, 0.5, 20.0)] == pytest.approx([-129.1] * 3)
+    assert [effect.term.function(v, **scale) for v in (0.0, 0.5, 20.0)] == pytest.approx([-129.1] * 3)
