@@ -66,8 +66,8 @@ def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     estimator = Pipeline(vehicle).estimator
     estimator.restore(snapshot, vehicle.key, 0.0)
     learner = estimator.forecaster.learner
-    price = learner.habits.price._replace(level=1.2, level_variance=0.01**2)
-    learner.state = learner.state._replace(habits=learner.habits._replace(price=price))
+    price = learner.state.habits.price._replace(level=1.2, level_variance=0.01**2)
+    learner.state = learner.state._replace(habits=learner.state.habits._replace(price=price))
     estimator.forecaster.ridden_by("anna")
     estimator.pack.state, estimator.pack.is_started = with_soc(estimator.pack.state, 0.6, 1e-4), True
     changed = estimator.snapshot(vehicle.key)

@@ -122,7 +122,7 @@ def battery_learned(estimator: Estimator) -> dict[str, LearnedFactor]:
 def riders_learned(estimator: Estimator) -> dict[str, dict[str, LearnedFactor]]:
     """Return the learned habits by rider and name; the last rider comes first."""
     learner = estimator.forecaster.learner
-    riders = {learner.rider: learner.habits, **learner.other_riders}
+    riders = {learner.rider: learner.state.habits, **learner.other_riders}
     return {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
 
 

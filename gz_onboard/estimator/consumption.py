@@ -350,21 +350,16 @@ class ConsumptionLearner:
     # --- results ------------------------------------------------------------------------------------------------
 
     @property
-    def habits(self) -> Habits:
-        """Of the present rider."""
-        return self.state.habits
-
-    @property
     def factor(self) -> float:
         """Measured over modelled energy of the present riding, without auxiliaries beyond the file's."""
-        return min(max(self.habits.factor.now, 1 / CONSUMPTION.most), CONSUMPTION.most)
+        return min(max(self.state.habits.factor.now, 1 / CONSUMPTION.most), CONSUMPTION.most)
 
     @property
     def auxiliary_factor(self) -> float:
         """Increase of the consumption factor by auxiliaries beyond the file's, at the pace of the present riding."""
         least, speed = CONSUMPTION.least_price, self.load.prior.speed
-        modelled = self.prior_price * max(self.habits.price.now, least) / self.factor  # J/m
-        return self.auxiliaries.mean / speed * max(self.habits.pace.now, least) / modelled
+        modelled = self.prior_price * max(self.state.habits.price.now, least) / self.factor  # J/m
+        return self.auxiliaries.mean / speed * max(self.state.habits.pace.now, least) / modelled
 
     @property
     def consumption_factor(self) -> float:
@@ -373,7 +368,7 @@ class ConsumptionLearner:
 
     def expected(self, way: float, ambient: float, altitude: float) -> ExpectedRiding:
         """The riding on the next `way` [m]; ambient in degC, altitude in m."""
-        c, habits, sums, speed = CONSUMPTION, self.habits, self.state.sums, self.load.prior.speed
+        c, habits, sums, speed = CONSUMPTION, self.state.habits, self.state.sums, self.load.prior.speed
         unit, standing = self.load.prior_prices(ambient, altitude)
         price, price_variance = habits.price.ahead(way)
         stops, stops_variance = habits.stops.ahead(way)
@@ -538,10 +533,10 @@ class ConsumptionLearner:
 
     def forget(self, distance: float) -> None:
         """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
-        seen = self.habits
+        seen = self.state.habits
         self.pause()
         self._revert(distance)
-        doubted = (mine.doubted(its.now) for mine, its in zip(self.habits, seen, strict=True))
+        doubted = (mine.doubted(its.now) for mine, its in zip(self.state.habits, seen, strict=True))
         self.state = self.state._replace(habits=Habits(*doubted))
 
     def ridden_by(self, rider: str) -> None:
@@ -551,7 +546,7 @@ class ConsumptionLearner:
         vehicle's, whoever rides.
         """
         self.pause()
-        before = self.habits.next_ride()
+        before = self.state.habits.next_ride()
         self.other_riders[self.rider] = before
         habits = self.other_riders.pop(rider, None)
         if habits is None:
@@ -575,7 +570,7 @@ class ConsumptionLearner:
         riding, self.still = self.still < CONSUMPTION.ride_ends_s, self.still + dt
         if riding and self.still >= CONSUMPTION.ride_ends_s:
             self.rides += 1
-            self.state = self.state._replace(habits=self.habits.next_ride())
+            self.state = self.state._replace(habits=self.state.habits.next_ride())
         if self.still >= CONSUMPTION.tyres_cool_s:
             self.load.time_moving = 0.0
 
@@ -586,7 +581,7 @@ class ConsumptionLearner:
         return {
             "unit": {"price": self.prior_price, "speed": self.load.prior.speed},
             "state": {
-                "habits": _saved(self.habits),
+                "habits": _saved(self.state.habits),
                 "sums": self.state.sums._asdict(),
                 "recent": self.state.recent._asdict(),
                 "terrain": self.state.terrain._asdict(),

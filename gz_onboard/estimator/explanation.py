@@ -29,9 +29,9 @@ from math import sqrt
 from gz_onboard.constants import MILD
 from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.estimator.forecast import Forecast, Forecaster
-from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, LoadModel
+from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
 from gz_onboard.events import Cause, Explanation
-from gz_onboard.physics.battery import Battery, Overpotential
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import cells_ahead, drawable
 from gz_onboard.physics.model import Model
 
@@ -178,7 +178,7 @@ class RangeExplainer:
         soc, form_factor_squared = battery.window.of_cells(1.0), CONSUMPTION.form_factor_squared
         consumption = unit * filed * prior.factor * sum(parts.values())
         power = consumption * prior.speed
-        cooling, lost = self._forecaster.cooling, self._overpotential(battery)
+        cooling, lost = self._forecaster.cooling, self._load.overpotential(battery)
         cells = cells_ahead(battery, cooling, (soc, MILD), MILD, (power, form_factor_squared), lost)
         state = RangeState(
             time=0.0,
@@ -232,7 +232,7 @@ class RangeExplainer:
         battery, cells = (b if Cause.AGE in changed else a).battery, (b if Cause.TEMPERATURE in changed else a).cells
         power = (b if Cause.SPEED in changed else a).power
         form_factor_squared = (b if Cause.STOPS in changed else a).form_factor_squared
-        return drawable(battery, b.soc, cells, power, form_factor_squared, self._overpotential(battery)).energy
+        return drawable(battery, b.soc, cells, power, form_factor_squared, self._load.overpotential(battery)).energy
 
     def _cost(self, a: RangeState, b: RangeState, changed: Collection[Cause]) -> float:
         """Consumption [J/m]; causes in `changed` as in `b`, the others as in `a`."""
@@ -250,7 +250,7 @@ class RangeExplainer:
         """Parts of the riding lately ridden, and of the prior riding as far as that is still expected."""
         learner, unit = self._forecaster.learner, sum(self._load.prior_prices(*USUAL_AIR))
         sums = learner.state.sums
-        learned = min(max(1 - learner.habits.price.variance / learner.prior.price.variance, 0.0), 1.0)
+        learned = min(max(1 - learner.state.habits.price.variance / learner.prior.price.variance, 0.0), 1.0)
         share = learned * sums.distance / (sums.distance + CONFIG.riding_m)
         if not (share and sums.prior and sums.speed_squares):
             return self._prior_parts
@@ -292,7 +292,3 @@ class RangeExplainer:
             parts[Cause.CLIMB] += time * ((drawn(grade=grade) + drawn(grade=-grade)) / 2 - level)
             parts[Cause.WIND] += time * (self._load.power(q) - level)
         return parts
-
-    def _overpotential(self, battery: Battery) -> Overpotential | None:
-        prior = self._load.prior
-        return self._load.model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})

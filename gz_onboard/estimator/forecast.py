@@ -16,7 +16,7 @@ from gz_onboard.constants import DECILE, HOUR
 from gz_onboard.estimator import consumption
 from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.consumption import CONSUMPTION, ConsumptionLearner
-from gz_onboard.estimator.load_model import AHEAD, Conditions
+from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.plausibility.electrical import PackReading
 from gz_onboard.estimator.saved_state import Each, Number
@@ -223,7 +223,6 @@ class Forecaster:
         self.new_battery, self._pack = battery, pack
         self.smoother = RangeSmoother()
         self.cooling = pack_constants(model.parameters)
-        self._ahead = {"vibration": prior.vibration, "time_moving": AHEAD}  # inputs of effects in the cells
         p = model.parameters
         self._cutoff_sd, self._empty_sd = p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty")  # V
         self._discharge: _Discharge | None = None  # the last one
@@ -301,7 +300,7 @@ class Forecaster:
             power=exp(discharge.inputs[4]),  # that the energy was computed for
             form_factor_squared=discharge.inputs[5],
             cells=discharge.cells,
-            known_from=learner.habits.price.known_from,
+            known_from=learner.state.habits.price.known_from,
         )
 
     def _discharged(self, *now: float) -> _Discharge:
@@ -317,7 +316,7 @@ class Forecaster:
                 return last._replace(left=last.left._replace(energy=energy))
         soc, temperature, sd, ambient, log_power, form_factor_squared = now
         load, battery = (exp(log_power), form_factor_squared), self.battery
-        lost = self.load.model.overpotential(battery, self._ahead)
+        lost = self.load.overpotential(battery)
         cells = cells_ahead(battery, self.cooling, (soc, temperature), ambient, load, lost)
         left, colder = (drawable(battery, soc, at, *load, lost) for at in (cells, cells - sd))
         self._discharge = _Discharge(inputs, health.weakest, cells, left, left.energy - colder.energy)
@@ -347,7 +346,7 @@ class Forecaster:
         self._soc = soc[0]
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
         self.latest = self.shown(along(free), drawn)
-        self._factor = self.learner.consumption_factor, sqrt(self.learner.habits.factor.variance)
+        self._factor = self.learner.consumption_factor, sqrt(self.learner.state.habits.factor.variance)
         if charging and voltage and current is not None:
             self._follow_charge(elapsed, soc[0], cells[0], voltage, current)
             self._full = self.forecast(self.battery.window.high, 0.0, *cells, *air)

@@ -18,7 +18,7 @@ from math import pi
 from typing import TYPE_CHECKING, NamedTuple
 
 from gz_onboard.constants import MILD
-from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery, Overpotential
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Model, Recall, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
@@ -135,6 +135,10 @@ class LoadModel:
         again = q | {"time_moving": q["time_moving"] + AHEAD}
         again.pop("heading", None)
         return power, self.power(again)
+
+    def overpotential(self, battery: Battery) -> Overpotential | None:
+        """Voltage [V] that a cell of `battery` loses to effects on the way to come, see `Model.overpotential`."""
+        return self.model.overpotential(battery, {"vibration": self.prior.vibration, "time_moving": AHEAD})
 
     def prior_prices(self, ambient: float, altitude: float, mass: float | None = None) -> tuple[float, float]:
         """Energy per metre of the prior riding [J/m], in motion and at its stops.

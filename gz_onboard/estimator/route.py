@@ -348,7 +348,7 @@ class RouteForecaster:
             if costs is None:
                 learner = self._forecaster.learner
                 self.cost = learner.factor
-                self.variance = learner.habits.factor.variance + (config.initial_sd * learner.factor) ** 2
+                self.variance = learner.state.habits.factor.variance + (config.initial_sd * learner.factor) ** 2
             self.costs = costs = route.costs(self._forecaster.load, air, self._forecaster.load.time_moving)
         self._learn(route, costs)
         return self._ahead(route, costs, free, soc, loss_variance)

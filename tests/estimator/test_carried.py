@@ -38,11 +38,11 @@ def test_a_tow_is_known_by_current_or_torque(seen):
     e = EventEstimator(groups, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
     for event in roll(600, 0.0, 390.0, seen):
         e.handle(event)
-    before = e.forecaster.learner.habits.price.now
+    before = e.forecaster.learner.state.habits.price.now
     for event in roll(400, 600.0, 0.0, seen):
         e.handle(event)
     assert e.forecaster.learner.towed
-    assert e.forecaster.learner.habits.price.now == pytest.approx(before, rel=0.02)
+    assert e.forecaster.learner.state.habits.price.now == pytest.approx(before, rel=0.02)
 
 
 WITNESSES = {
@@ -70,7 +70,7 @@ def test_a_scooter_in_a_van_is_parked(witness):
     learner = e.forecaster.learner
     for event in stand(180, 0.0, 0.0, (0.0, 0.0)):
         e.handle(event)
-    before = learner.habits, e.motion.distance
+    before = learner.state.habits, e.motion.distance
     seen = set()
     for event in stand(1200, 180.0, 15.0, (0.0, 0.0)):
         e.handle(event)
@@ -78,6 +78,6 @@ def test_a_scooter_in_a_van_is_parked(witness):
     estimate = e.estimate(event[0])
     assert estimate.activity is Activity.PARKED
     assert not estimate.distrusted
-    assert learner.habits == before[0]
+    assert learner.state.habits == before[0]
     assert seen == {(Activity.PARKED, ())}
     assert e.motion.distance == before[1]

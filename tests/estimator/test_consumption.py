@@ -101,7 +101,7 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
     learner.state = learner.state._replace(habits=Habits(quantity, prior.stops, prior.pace, quantity))
     again = Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding).learner
     again.restore(json.loads(json.dumps(learner.snapshot())))
-    assert again.habits == learner.habits
+    assert again.state.habits == learner.state.habits
     assert quantity.ahead(10_000.0)[1] >= 0
     assert quantity.variance >= 0
 

@@ -168,7 +168,7 @@ def test_rolling_down_a_known_hill_is_still_riding(drift):
         ride(each, 8)
         roll(each, 4, grade=-0.0262, drift=drift, drive=drive)  # as much as keeps the speed
     assert not f.learner.towed
-    assert f.learner.habits == driven.learner.habits
+    assert f.learner.state.habits == driven.learner.state.habits
 
 
 def test_who_rides_in_mountains_has_a_wider_interval_over_a_restart_too():
@@ -305,7 +305,7 @@ def test_nothing_from_before_a_restart_is_unlearned():
     again.restore(json.loads(json.dumps(f.snapshot())))
     ride(again, 0.6)
     again.forget(2000.0)
-    assert again.learner.habits.price.now == pytest.approx(f.learner.habits.price.now)
+    assert again.learner.state.habits.price.now == pytest.approx(f.learner.state.habits.price.now)
 
 
 def test_a_vehicle_whose_rides_change_has_a_wide_interval():

@@ -20,7 +20,7 @@ def forecaster() -> Forecaster:
 
 def rides(f: Forecaster, price: float, km: int = 40) -> None:
     """At `price` times what the model says of the prior riding, and a rest after it."""
-    learner, habits = f.learner, f.learner.habits
+    learner, habits = f.learner, f.learner.state.habits
     for _ in range(int(km * 1000 / CONSUMPTION.segment_m)):
         habits = habits._replace(price=habits.price.learned(price - habits.price.now, CONSUMPTION.segment_m))
     sums = Segment(distance=CONSUMPTION.segment_m, duration=20.0)
@@ -34,25 +34,25 @@ def test_each_rider_has_a_price_and_it_is_kept():
             f.ridden_by(name)
             rides(f, price)
     f.ridden_by("anna")
-    assert f.learner.habits.price.level == pytest.approx(0.9, abs=0.05)
+    assert f.learner.state.habits.price.level == pytest.approx(0.9, abs=0.05)
     assert not f.learner.state.sums.distance, "riding of another rider tells nothing"
     restored = forecaster()
     restored.restore(json.loads(json.dumps(f.snapshot())))
     assert restored.learner.rider == "anna"
     restored.ridden_by("ben")
-    assert restored.learner.habits.price.level == pytest.approx(1.3, abs=0.05)
+    assert restored.learner.state.habits.price.level == pytest.approx(1.3, abs=0.05)
 
 
 def test_who_never_rode_is_taken_for_the_one_before_but_less_surely():
     f = forecaster()
     f.ridden_by("anna")
     rides(f, 1.2)
-    known = f.learner.habits.next_ride()
+    known = f.learner.state.habits.next_ride()
     f.ridden_by("ben")
-    price = f.learner.habits.price
+    price = f.learner.state.habits.price
     assert price.level == pytest.approx(known.price.level)
     assert price.level_variance == pytest.approx(known.price.level_variance + CONSUMPTION.level_sd**2)
-    assert f.learner.habits.factor == known.factor, "errors of the parameters are the vehicle's"
+    assert f.learner.state.habits.factor == known.factor, "errors of the parameters are the vehicle's"
 
 
 def test_the_same_rider_again_changes_nothing():

@@ -244,7 +244,7 @@ def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     for vibration in (0.01, 2.5):
         e = estimated(loose, events(60, vibration))
         assert e.pack.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
-    settled = e.forecaster._overpotential
+    settled = e.forecaster.load.overpotential(e.pack.battery)
     assert settled is not None
     assert settled(1.0, 0.5, 20.0, 2.0) == pytest.approx(0.01 * TYPICAL)
 
