@@ -78,7 +78,7 @@ def _fetched(url: str) -> Path:
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "log": (f"log: {_LOGS}", {"type": _log, "metavar": "LOG"}),
     "logs": (
-        f"logs of rides: {_LOGS}; URLs, patterns, or folders of them (CSV files in folders are skipped)",
+        f"logs of rides: {_LOGS}; URLs, or folders of them (CSV files in folders are skipped)",
         {"nargs": "+", "type": _log, "metavar": "LOG"},
     ),
     "--vehicle": (

@@ -22,7 +22,7 @@ from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, 
 from gz_onboard.bus.layout import crc_differences, first_bit, is_not_available
 from gz_onboard.bus.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
-from gz_onboard.pipeline import TICK_NS, TICKS_PER_WINDOW, WINDOW_NS, Pipeline
+from gz_onboard.pipeline import TICK_NS, WINDOW_NS, Pipeline
 from gz_onboard.progress import Progress
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.timeline import on_timeline, stray
@@ -49,8 +49,7 @@ class LogWindow(NamedTuple):
 
     end_ns: int  # on the timeline
     clock_ns: int  # the same by the clock of the frames
-    follows: bool  # begins where the window before ended
-    frames: slice  # of the log
+    end: int  # the first frame of the log behind it
     windows: list[MessageWindow]
 
 
@@ -139,7 +138,7 @@ class DecodedLog:
         now = self._now_ns
         number = (now - TICK_NS) // WINDOW_NS + 1  # of the window of each frame
         edges = _edges(number).tolist()
-        events, decoded, follows = self._events_of(number), dict[int, list[MessageWindow]](), False
+        events, decoded = self._events_of(number), dict[int, list[MessageWindow]]()
         for place, (begin, end) in enumerate(pairwise(edges)):
             if place % _WINDOWS_AT_ONCE == 0:
                 decoded = self._windows(number, begin, edges[place : place + _WINDOWS_AT_ONCE + 1][-1])
@@ -156,12 +155,10 @@ class DecodedLog:
             windows += decoded.get(window, [])
             clock_ns = int(self.frames.time_ns[end - 1] - self._passed_ns[end - 1])
             paused = now[end] - now[end - 1] > _LONGEST_GAP_NS
-            rows = slice(begin, end)
             for ended in range(window, window + 1 if paused else int(number[end])):
                 end_ns = TICK_NS + ended * WINDOW_NS
-                yield LogWindow(end_ns, end_ns + clock_ns, follows, rows, windows)
-                rows, windows, follows = slice(end, end), [], True
-            follows = not paused
+                yield LogWindow(end_ns, end_ns + clock_ns, end, windows)
+                windows = []
         self.see_latest(len(now))
 
     def see_latest(self, end: int) -> None:
@@ -173,10 +170,6 @@ class DecodedLog:
     def tuples(self, rows: slice) -> list[Frame]:
         """The frames of a part of the log but those of wrong times."""
         return self.frames[rows][~self._odd[rows]].tuples()
-
-    def until(self, rows: slice, end_ns: int) -> int:
-        """The first row of a part of the log that came not before `end_ns` on the timeline."""
-        return int(rows.start + np.searchsorted(self._now_ns[rows], end_ns))
 
     def _count(self, counts: dict[Any, int], key: Any, rows: Rows, numbers: NDArray[np.int64] | None = None) -> None:
         """Have `counts[key]` count the frames in these rows, or these numbers at them."""
@@ -296,37 +289,25 @@ def decode_columns(frames: FrameColumns, codec: Codec, odd: Mask | None = None) 
 def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = None) -> None:
     """Take all frames of a log through a new `pipeline`, in the windows of the daemon.
 
-    progress: called with numbers of frames taken.
+    Of the status frames that the daemon sends, only those at the end of a window are made. progress: called with
+    numbers of frames taken.
     """
-    decoded = DecodedLog(frames, pipeline.codec, stray(frames.time_ns))
-    done = 0
+    decoded, done = DecodedLog(frames, pipeline.codec, stray(frames.time_ns)), 0
     for step in decoded.steps():
-        if pipeline.frame_log:
-            _log_frames(pipeline, decoded, step)
+        rows, done = slice(done, step.end), step.end
         if pipeline.signal_log:
-            decoded.see_latest(step.frames.stop)
+            decoded.see_latest(done)
+        if pipeline.frame_log:
+            pipeline.frame_log.frames(decoded.tuples(rows))
         pipeline.end_window(step.windows, step.end_ns * 1e-9, step.clock_ns)
         if pipeline.frame_log:
             pipeline.publish(step.clock_ns)
         if progress:
-            progress(step.frames.stop - done)
-        done = step.frames.stop
+            progress(rows.stop - rows.start)
     if pipeline.frame_log:
-        pipeline.frame_log.frames(decoded.tuples(slice(done, len(frames))))
+        pipeline.frame_log.frames(decoded.tuples(slice(done, None)))
     if progress:
         progress(len(frames) - done)
-
-
-def _log_frames(pipeline: Pipeline, decoded: DecodedLog, step: LogWindow) -> None:
-    """Log the frames of a window, and between them the status frames that the daemon would have sent."""
-    assert pipeline.frame_log
-    rows = step.frames
-    for tick in range(TICKS_PER_WINDOW - 1, 0, -1) if step.follows else ():
-        end = decoded.until(rows, step.end_ns - tick * TICK_NS)
-        pipeline.frame_log.frames(decoded.tuples(slice(rows.start, end)))
-        pipeline.publish(step.clock_ns - tick * TICK_NS)
-        rows = slice(end, rows.stop)
-    pipeline.frame_log.frames(decoded.tuples(rows))
 
 
 def _edges(number: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -18,10 +18,10 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
@@ -108,8 +108,8 @@ def read_log(
     frames = _READERS[suffix](unpacked(_load(path), damage), damage)
     impossible = frames.impossible()
     if impossible.any():
-        for frame in frames[impossible].tuples():
-            damage.add("a frame", _problem(frame))
+        (first,) = frames[np.flatnonzero(impossible)[:1]].tuples()
+        damage.add("a frame", _problem(first), int(impossible.sum()))
         frames = frames[~impossible]
     if damage.count:
         (on_damage or _warn)(damage)
@@ -189,12 +189,11 @@ def _by_content(head: bytes, time: str = "") -> str | None:
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
     """`paths`, with the logs in a folder and its subfolders in place of it, by name. InputError for one without any.
 
-    A pattern with ``*`` that the shell left is expanded. CSV and text files of a folder are skipped, as they are mostly
-    something else, and so is what ``gz-onboard estimate`` wrote. estimates: take that in place of the logs that it is
-    of; None: take both.
+    CSV and text files of a folder are skipped, as they are mostly something else, and so is what ``gz-onboard
+    estimate`` wrote. estimates: take that in place of the logs that it is of; None: take both.
     """
     logs: list[Path] = []
-    for path in chain.from_iterable(map(_expanded, paths)):
+    for path in paths:
         if not path.is_dir():
             logs.append(path)
             continue
@@ -211,19 +210,6 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
             raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
     return logs
-
-
-def _expanded(path: Path) -> list[Path]:
-    """The files that match a pattern, or the path itself."""
-    if any(letter in str(path) for letter in "*?[") and not path.exists():
-        try:
-            found = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
-        if not found:
-            raise InputError(f"{path}: no files match")
-        return found
-    return [path]
 
 
 def log_stem(log: Path) -> str:
