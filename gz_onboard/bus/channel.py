@@ -78,39 +78,10 @@ class _Message(ctypes.Structure):
     _fields_ = (("header", _Header), ("received", ctypes.c_uint))
 
 
-class _BatchReader:
-    """Reads many CAN frames with one system call, recvmmsg(2)."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
-        self._data = ctypes.create_string_buffer(BATCH * _FRAME.size)
-        self._control = ctypes.create_string_buffer(BATCH * _CONTROL.size)
-        data, control = ctypes.addressof(self._data), ctypes.addressof(self._control)
-        self._vectors = (_IoVec * BATCH)(*(_IoVec(data + i * _FRAME.size, _FRAME.size) for i in range(BATCH)))
-        self._messages = (_Message * BATCH)()
-        for i, message in enumerate(self._messages):
-            header = message.header
-            header.io_vector, header.io_vectors = ctypes.pointer(self._vectors[i]), 1
-            header.control, header.control_size = control + i * _CONTROL.size, _CONTROL.size
-        self._unread = bytes(self._messages)
-
-    def read(self) -> Iterator[tuple[tuple[int, int, bytes], tuple[int, ...]]]:
-        """Return `_FRAME` and `_CONTROL` of the waiting frames, at most `BATCH`. OSError for a bus that is down."""
-        ctypes.memmove(self._messages, self._unread, len(self._unread))  # the kernel has shortened them
-        ctypes.memset(self._control, 0, len(self._control))
-        count = self._receive(self._descriptor, self._messages, BATCH, socket.MSG_DONTWAIT, None)
-        if count < 0 and (number := ctypes.get_errno()) != errno.EAGAIN:
-            raise OSError(number, os.strerror(number))
-        count = max(count, 0)
-        frames, control = self._data.raw[: count * _FRAME.size], self._control.raw[: count * _CONTROL.size]
-        return zip(_FRAME.iter_unpack(frames), _CONTROL.iter_unpack(control), strict=True)
-
-
 class SocketCanBus:
     """An open SocketCAN interface, read by its raw socket with the kernel's filters, time stamps and drop counter.
 
-    The kernel buffers the frames between two ticks, so a tick costs one wake-up, not hundreds: a fifth of the time of
+    The kernel buffers the frames between two ticks, and recvmmsg(2) reads up to `BATCH` at once: a fifth of the time of
     python-can's reader thread. OSError if there is no such interface. identifiers: the only ones to be received.
     """
 
@@ -133,13 +104,36 @@ class SocketCanBus:
         except OSError:
             raw.close()
             raise
-        self._reader = _BatchReader(raw.fileno())
+        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
+        self._data = ctypes.create_string_buffer(BATCH * _FRAME.size)
+        self._control = ctypes.create_string_buffer(BATCH * _CONTROL.size)
+        data, control = ctypes.addressof(self._data), ctypes.addressof(self._control)
+        self._vectors = (_IoVec * BATCH)(*(_IoVec(data + i * _FRAME.size, _FRAME.size) for i in range(BATCH)))
+        self._messages = (_Message * BATCH)()
+        for i, message in enumerate(self._messages):
+            header = message.header
+            header.io_vector, header.io_vectors = ctypes.pointer(self._vectors[i]), 1
+            header.control, header.control_size = control + i * _CONTROL.size, _CONTROL.size
+        self._unread = bytes(self._messages)
+        self._read = 0  # frames, by the last call
+
+    def _receive_batch(self) -> Iterator[tuple[tuple[int, int, bytes], tuple[int, ...]]]:
+        """`_FRAME` and `_CONTROL` of the waiting frames, at most `BATCH`. OSError for a bus that is down."""
+        # The kernel has shortened what it used. Control messages that it leaves out now it has never written.
+        ctypes.memmove(self._messages, self._unread, self._read * ctypes.sizeof(_Message))
+        count = self._receive(self._socket.fileno(), self._messages, BATCH, socket.MSG_DONTWAIT, None)
+        if count < 0 and (number := ctypes.get_errno()) != errno.EAGAIN:
+            raise OSError(number, os.strerror(number))
+        self._read = count = max(count, 0)
+        frames = ctypes.string_at(self._data, count * _FRAME.size)
+        control = ctypes.string_at(self._control, count * _CONTROL.size)
+        return zip(_FRAME.iter_unpack(frames), _CONTROL.iter_unpack(control), strict=True)
 
     def drain(self, frames: list[Frame], index: int, limit: int, until: float) -> bool:
         """Append the waiting frames, at most `limit`, until a monotonic time [s]; whether more may be waiting."""
         for _ in range(0, limit, BATCH):
             before = len(frames)
-            for (identifier, length, payload), (_, _, kind, seconds, ns, _, _, counted, lost) in self._reader.read():
+            for (identifier, length, payload), (_, _, kind, seconds, ns, _, _, counted, lost) in self._receive_batch():
                 time_ns = seconds * 1_000_000_000 + ns if kind == SO_TIMESTAMPNS else time.time_ns()
                 frames.append((time_ns, identifier, payload[:length], index))
                 if counted == SO_RXQ_OVFL:  # the kernel's counter wraps
@@ -194,7 +188,7 @@ class CanChannel:
         except OSError as error:
             if self.interface == SOCKETCAN and error.errno == errno.EAFNOSUPPORT:
                 raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error
-            self._close()
+            self.close()
 
     def _open(self) -> None:
         if self.interface == SOCKETCAN:
@@ -204,7 +198,8 @@ class CanChannel:
 
             self._bus = LibraryBus(self.interface, self.name, self._identifiers, self._options)
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close the bus; `drain` opens it again, `RETRY_S` later."""
         self._retry_at = time.monotonic() + RETRY_S
         self._overflow = self.overflow
         bus, self._bus = self._bus, None
@@ -222,7 +217,7 @@ class CanChannel:
             if self._bus is not None:
                 self.behind = self._bus.drain(frames, self.index, MAX_FRAMES, time.monotonic() + READ_S)
         except OSError:  # ENETDOWN, ENODEV: the frames read before are still good
-            self._close()
+            self.close()
         return frames
 
     def send(self, frame: Frame) -> bool:
@@ -234,10 +229,6 @@ class CanChannel:
         except OSError as error:
             self.send_failures += 1
             if error.errno not in (errno.ENOBUFS, errno.EAGAIN, None):
-                self._close()
+                self.close()
             return False
         return True
-
-    def close(self) -> None:
-        """Close for good."""
-        self._close()
