@@ -6,10 +6,8 @@ a daemon which never reads an MF4 file would pay at each start.
 
 from __future__ import annotations
 
-import importlib
 import os
 import socket
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,23 +16,10 @@ from typing import Any
 
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
-from gz_onboard.imports import require
+from gz_onboard.imports import require, without
 
-
-def _import_without_asammdf() -> None:
-    """Import python-can with asammdf hidden from it, unless either is there already."""
-    if "can" in sys.modules or "asammdf" in sys.modules:
-        return
-    sys.modules["asammdf"] = None  # type: ignore[assignment]  # an import then raises ModuleNotFoundError
-    try:
-        importlib.import_module("can")
-    finally:
-        del sys.modules["asammdf"]
-
-
-_import_without_asammdf()
-
-import can  # noqa: E402
+with without("asammdf", "numpy"):
+    import can
 
 __all__ = ["LibraryBus", "can", "check_interface", "flagged", "open_bus"]
 

@@ -33,10 +33,12 @@ def identifiers_of(mapping: BusMapping, messages: Collection[str] | None = None)
 
 def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:
     """The raw values that are physical: within the DBC's limits, without the code for not available."""
-    conversion = signal.conversion
+    conversion, bits = signal.conversion, signal.length
     scale, offset = float(conversion.scale), float(conversion.offset)
-    low, high = _representable(signal)
-    if not_available and not conversion.is_float and signal.length >= 8:
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signal.is_signed else (0, 2**bits - 1)
+    if conversion.is_float:
+        low, high = -3.4e38, 3.4e38
+    elif not_available and bits >= 8:
         low, high = (low + 1, high) if signal.is_signed else (low, high - 1)
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
         limits = max(float(signal.minimum), -FARTHEST), min(float(signal.maximum), FARTHEST)
@@ -55,15 +57,6 @@ def plausible_range(source: Source, low: float, high: float) -> tuple[float, flo
     limits = PLAUSIBLE_OF.get(source.role, PLAUSIBLE[ROLES[source.role]])
     ends = sorted((value - source.offset) / source.factor for value in limits)
     return (low if low >= ends[0] else ends[0]), (high if high <= ends[1] else ends[1])
-
-
-def _representable(signal: Signal) -> tuple[float, float]:
-    """The least and the greatest raw value that the bits of `signal` can hold."""
-    if signal.conversion.is_float:
-        return -3.4e38, 3.4e38
-    if signal.is_signed:
-        return -(2 ** (signal.length - 1)), 2 ** (signal.length - 1) - 1
-    return 0, 2**signal.length - 1
 
 
 def is_not_available(signal: Signal, raw: Any) -> Any:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from gz_onboard.toml import Table
 
-MOST_FILES = 20
 LONGEST_DELAY = 10.0  # s, of a message
 MOST_CHANNELS = 127
 
@@ -134,8 +133,6 @@ def _time_column(table: Table) -> TimeColumn | None:
 
 def _dbc_files(vehicle: Table) -> list[Path]:
     names = [vehicle.check_path("dbc", name) for name in vehicle.texts("dbc", "DBC file names")]
-    if len(names) > MOST_FILES:
-        raise vehicle.error(f"names {len(names)} files, the most are {MOST_FILES}", "dbc")
     try:
         return [find_dbc(name, vehicle.file.parent) for name in names]
     except InputError as error:

@@ -175,21 +175,22 @@ def range_messages(file: Path) -> dict[str, Message]:
 
     InputError for a message or signal of ``dbc/range.dbc`` that is missing or cannot be sent.
     """
-    own = find_dbc(RANGE_DBC)
-    return _range_messages(file, read_dbc(file), own, read_dbc(own))
+    return _range_messages(file, read_dbc(file))
 
 
 @cache  # a vehicle makes several publishers
-def _range_messages(file: Path, text: str, own: Path, own_text: str) -> dict[str, Message]:
-    standard = database_of([(own, own_text)])
-    found = {message.name: message for message in (standard if file == own else database_of([(file, text)])).messages}
-    for wanted in standard.messages:
-        if wanted.name not in found:
-            near = nearest(wanted.name, found)
-            raise InputError(f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{near}")
-        if problem := _message_problem(found[wanted.name], wanted):
-            raise InputError(f"{file}: message {wanted.name}: {problem}")
-    return {wanted.name: found[wanted.name] for wanted in standard.messages}
+def _range_messages(file: Path, text: str) -> dict[str, Message]:
+    found = {message.name: message for message in database_of([(file, text)]).messages}
+    own = find_dbc(RANGE_DBC)
+    if file == own:
+        return found
+    standard = range_messages(own)
+    for name, wanted in standard.items():
+        if name not in found:
+            raise InputError(f"{file}: has no message {name}, which {RANGE_DBC} has{nearest(name, found)}")
+        if problem := _message_problem(found[name], wanted):
+            raise InputError(f"{file}: message {name}: {problem}")
+    return {name: found[name] for name in standard}
 
 
 def _message_problem(message: Message, wanted: Message) -> str:
