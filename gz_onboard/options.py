@@ -11,7 +11,7 @@ from typing import Any
 
 from gz_onboard.errors import InputError
 
-LOG_SUFFIXES = (".mcap", ".blf", ".log", ".asc", ".csv", ".trc", ".mf4", ".crtd")
+LOG_SUFFIXES = (".mcap", ".blf", ".log", ".asc", ".csv", ".trc", ".mf4")
 _LOGS = f"{' '.join(LOG_SUFFIXES)}, each also with .gz"
 MOST_JOBS = 256
 """Processes: each takes some 100 MB and keeps a processor busy."""

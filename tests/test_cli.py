@@ -311,4 +311,4 @@ def test_a_folder_of_tables_says_how_to_give_them(tmp_path: Path, capsys: pytest
     assert "; its tables must be given one by one, such as ride.csv" in said
     (tmp_path / "ride.csv").rename(tmp_path / "notes.md")  # a text that looks like a table is none
     said = refused(capsys, "estimate", str(tmp_path))
-    assert said.endswith(": this folder holds no log (.mcap, .blf, .log, .asc, .csv, .trc, .mf4, .crtd)\n")
+    assert said.endswith(": this folder holds no log (.mcap, .blf, .log, .asc, .csv, .trc, .mf4)\n")

@@ -1,4 +1,4 @@
-"""Read recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
+"""Read recorded frames: our own MCAP, the formats of python-can, and SavvyCAN's, each also gzipped.
 
 The content tells the format; the name only where the content does not. A damaged log is read as far as possible: what
 is lost is counted and reported once (`LogDamage`), never silently and never by giving up. Times that are not since 1970
@@ -57,7 +57,6 @@ _READERS: dict[str, Reader] = {
     ".blf": blf.read,
     ".log": text.read_candump,
     **{suffix: _python_can(suffix) for suffix in (".asc", ".csv", ".trc", ".mf4")},
-    ".crtd": text.read_crtd,
     _SAVVYCAN: text.read_savvycan,
     _TABLE: _refuse_table,
 }
@@ -81,7 +80,6 @@ _FIRST_LINES = {
         re.I,
     ),
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
-    ".crtd": text.CRTD_LINE,
     ".log": re.compile(rf"(?:{text.CANDUMP_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""

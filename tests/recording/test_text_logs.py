@@ -51,7 +51,6 @@ def test_savvycan_without_the_direction_and_its_zeros_behind_the_data(tmp_path):
     "text",
     [
         f"{SAVVYCAN}1700000000000000,120,false,Rx,0,1,90,\n",
-        "1700000000.0 1R11 120 90\n",
         "(1700000000.0) can0 120#90\n",
         "base dec timestamps absolute\n 1700000000.0 1 288 Rx d 1 144\n",
     ],
@@ -81,22 +80,6 @@ def test_savvycan_lines_that_are_none_are_counted_and_the_first_named(tmp_path):
 def test_a_savvycan_header_over_something_else_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"line 2: not a line of SavvyCAN's CSV.*'hello'"):
         frames_of(tmp_path, f"{SAVVYCAN}hello\nworld\n", "r.csv")
-
-
-def test_crtd(tmp_path):
-    text = (
-        "# a ride\n1542473901.000000 CXX OVMS CRTD\n1542473901.020305 1R11 7E8 01 02 0F\n"
-        "1542473901.030305 2CEV something\n1542473901.040305 2T29 18DAF110 \n1542473901.05 R11 0000021A FE\n"
-    )
-    at = 1542473901 * S
-    assert frames_of(tmp_path, text, "ride.crtd") == [
-        (at + 20305_000, 0x7E8, b"\x01\x02\x0f", 0),
-        (at + 40305_000, 0x18DAF110 | EFF_FLAG, b"", 1 | TRANSMITTED),
-        (at + 50 * MS, 0x21A, b"\xfe", 0),
-    ]
-    damages: list[LogDamage] = []
-    frames_of(tmp_path, f"{text}1542473902.0 1R11 FFF 00\n1542473902.0 1R11 100 0\n", "ride.log", damages)
-    assert [(damage.count, damage.place) for damage in damages] == [(2, "line 7")]
 
 
 def test_candump_as_on_the_screen(tmp_path):

@@ -1,11 +1,11 @@
-"""Text logs with a frame on each line: candump's, SavvyCAN's CSV and the CRTD of OVMS."""
+"""Text logs with a frame on each line: candump's and SavvyCAN's CSV."""
 
 from __future__ import annotations
 
 import logging
 import re
 from codecs import BOM_UTF8
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from io import StringIO
@@ -30,17 +30,6 @@ Parser: TypeAlias = Callable[[str], Frame | None]
 """Takes a line with its line end; None for one that holds no frame. Raises ValueError for one that is damaged."""
 
 
-def text_pieces(data: Contents) -> Iterator[str]:
-    """Yield the text in pieces of whole lines, without a byte order mark; bytes that are not ASCII do no harm."""
-    position = len(BOM_UTF8) if data[: len(BOM_UTF8)] == BOM_UTF8 else 0
-    while position < len(data):
-        end = position + _PIECE
-        if end < len(data):
-            end = data.find(b"\n", end) + 1 or len(data)
-        yield str(data[position:end], "latin-1")
-        position = end
-
-
 def read_lines(
     data: Contents,
     damage: LogDamage,
@@ -53,9 +42,11 @@ def read_lines(
     parse_many: parses many lines at once; None if any line needs `parse`. name: of the format, for messages. Raises
     InputError if there is no frame before the first damage.
     """
-    number = 0
+    number, position = 0, len(BOM_UTF8) if data[: len(BOM_UTF8)] == BOM_UTF8 else 0
     parts: list[FrameColumns] = []
-    for text in text_pieces(data):
+    while position < len(data):
+        end = data.find(b"\n", position + _PIECE) + 1 or len(data)
+        text, position = str(data[position:end], "latin-1"), end  # bytes that are not ASCII do no harm
         frames = parse_many(text)
         if frames is None:
             frames = []
@@ -148,8 +139,7 @@ class _CandumpParser:
     """Parses lines of one log."""
 
     def __init__(self) -> None:
-        self._identifiers = _Identifiers()
-        self._channels = ChannelNumbers()
+        self._identifiers, self._channels = _Identifiers(), ChannelNumbers()
 
     def many(self, text: str) -> list[Frame] | None:
         """The frames of whole lines of ``candump -L``; None if any line is out of the ordinary."""
@@ -193,21 +183,14 @@ class _CandumpParser:
             data = bytes(min(length, 8))
         elif len(data) != length:
             raise ValueError(f"{len(data)} bytes where there should be {length}")
+        time_ns, stamp, channel = 0, match["stamp"], self._channels[match["channel"]]
+        if stamp and "-" in stamp[1:]:
+            since = datetime.fromisoformat(stamp).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+            time_ns = since // timedelta(microseconds=1) * 1000
+        elif stamp:
+            time_ns = stamp_ns(stamp)
         sent = (match["screen"] or match["log"] or "R").upper() == "T"
-        return (
-            _time_ns(match["stamp"]),
-            identifier,
-            data,
-            self._channels[match["channel"]] | (TRANSMITTED if sent else 0),
-        )
-
-
-def _time_ns(stamp: str | None) -> int:
-    """The time of a line [ns]; 0 if it has none."""
-    if stamp and "-" in stamp[1:]:
-        since = datetime.fromisoformat(stamp).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-        return since // timedelta(microseconds=1) * 1000
-    return stamp_ns(stamp) if stamp else 0
+        return time_ns, identifier, data, channel | (TRANSMITTED if sent else 0)
 
 
 def read_candump(data: Contents, damage: LogDamage) -> FrameColumns:
@@ -216,29 +199,20 @@ def read_candump(data: Contents, damage: LogDamage) -> FrameColumns:
     return read_lines(data, damage, parser.one, "a candump log", parser.many)
 
 
-# --- SavvyCAN and OVMS --------------------------------------------------------------------------------------------
+# --- SavvyCAN -----------------------------------------------------------------------------------------------------
 
 SAVVYCAN_HEADER = re.compile(r"\s*\"?time ?stamp[^,]*,\s*id,\s*extended,(?P<direction>\s*dir,)?\s*bus,\s*len\b", re.I)
-CRTD_LINE = re.compile(
-    r"(?P<stamp>-?\d+(?:\.\d+)?)\s+(?P<bus>\d)?(?:(?P<direction>[RT])(?P<bits>11|29)\s+(?P<id>[0-9A-Fa-f]{1,8})"
-    r"(?P<data>(?:\s+[0-9A-Fa-f]{2})*)|C[A-Z]{2}\b.*)"
-)
-_GREATEST = {False: MOST_STANDARD, True: MOST_EXTENDED}  # identifier, by whether it is extended
+_BEGINNING = 200  # bytes that hold the header
 _MICROSECOND_NS = 1000  # unit of stamps without a decimal point
 
 
 def read_savvycan(data: Contents, damage: LogDamage) -> FrameColumns:
-    """Read SavvyCAN's CSV; lines that are none are noted as damage."""
+    """Read SavvyCAN's CSV; lines that are none are noted as damage.
+
+    Columns: time stamp, identifier, extended, direction (not in the older form), bus, length, bytes.
+    """
     header = SAVVYCAN_HEADER.search(str(data[:_BEGINNING], "latin-1"))
-    return read_lines(data, damage, _savvycan(bool(header and header["direction"])), "SavvyCAN's CSV")
-
-
-_BEGINNING = 200  # bytes that hold the header
-
-
-def _savvycan(has_direction: bool) -> Parser:
-    """Columns: time stamp, identifier, extended, direction (not in the older form), bus, length, bytes."""
-    later = 1 if has_direction else 0
+    later = 1 if header and header["direction"] else 0
 
     def parse(line: str) -> Frame | None:
         if SAVVYCAN_HEADER.match(line):
@@ -247,41 +221,14 @@ def _savvycan(has_direction: bool) -> Parser:
         if len(cells) < 5 + later:
             raise ValueError(f"{len(cells)} columns where there should be {5 + later} or more")
         identifier, length = int(cells[1], 16), int(cells[4 + later])
-        extended = cells[2].lower() in ("true", "1") or identifier > _GREATEST[False]
-        data = _bytes(cells[5 + later : 5 + later + length], length)
+        if not 0 <= identifier <= MOST_EXTENDED:
+            raise ValueError(f"identifier {identifier:X} has more than 29 bits")
+        if cells[2].lower() in ("true", "1") or identifier > MOST_STANDARD:
+            identifier |= EFF_FLAG
+        digits = cells[5 + later : 5 + later + length]
+        if length not in FD_LENGTHS or len(digits) != length or any(len(byte) != 2 for byte in digits):
+            raise ValueError(f"not {length} bytes of two digits, as a frame may have")
         channel = int(cells[3 + later]) & ~TRANSMITTED | (TRANSMITTED if later and cells[3][:1] in "Tt" else 0)
-        return stamp_ns(cells[0], _MICROSECOND_NS), _identifier(identifier, extended), data, channel
+        return stamp_ns(cells[0], _MICROSECOND_NS), identifier, bytes.fromhex("".join(digits)), channel
 
-    return parse
-
-
-def read_crtd(data: Contents, damage: LogDamage) -> FrameColumns:
-    """Read a log of OVMS; lines that are none are noted as damage."""
-    return read_lines(data, damage, _crtd, "a CRTD log")
-
-
-def _crtd(line: str) -> Frame | None:
-    if line.startswith("#"):
-        return None
-    if not (match := CRTD_LINE.fullmatch(line.strip())):
-        raise ValueError("neither a frame nor a comment")
-    if match["direction"] is None:
-        return None
-    cells = match["data"].split()
-    channel = max(int(match["bus"] or 1) - 1, 0) | (TRANSMITTED if match["direction"] == "T" else 0)
-    identifier = _identifier(int(match["id"], 16), match["bits"] == "29")
-    return stamp_ns(match["stamp"], _MICROSECOND_NS), identifier, _bytes(cells, len(cells)), channel
-
-
-def _identifier(value: int, extended: bool) -> int:
-    if not 0 <= value <= _GREATEST[extended]:
-        raise ValueError(f"identifier {value:X} has more than {29 if extended else 11} bits")
-    return value | EFF_FLAG if extended else value
-
-
-def _bytes(cells: list[str], length: int) -> bytes:
-    if length not in FD_LENGTHS:
-        raise ValueError(f"no frame has {length} bytes")
-    if len(cells) != length or not all(len(cell) == 2 for cell in cells):
-        raise ValueError(f"not {length} bytes of two digits")
-    return bytes.fromhex("".join(cells))
+    return read_lines(data, damage, parse, "SavvyCAN's CSV")
