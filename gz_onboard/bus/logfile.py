@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from operator import itemgetter
-from pathlib import Path
 from typing import IO, Any, TypeAlias
 
 from gz_onboard import __version__
@@ -48,7 +47,7 @@ class LogFile:
         self.start_ns = start_ns
         self.unsynced_frames = 0
         self.flushed = False
-        self._stream = stream
+        self.stream = stream
         self._pending: list[Frame] = []
         self._held: list[_Sample] = []  # younger than the first of the pending frames
         self._channels: dict[str, int] = {}
@@ -104,36 +103,24 @@ class LogFile:
             self._write_block(_block_length(self._pending))
         self._writer.flush()  # type: ignore[no-untyped-call]
         if to_disk:
-            os.fdatasync(self._stream.fileno())
+            os.fdatasync(self.stream.fileno())
         self.unsynced_frames = 0
         self.flushed = True
-
-    def size(self) -> int:
-        """Bytes written so far, without what still waits for a chunk to be full."""
-        return self._stream.tell()
-
-    def vanished(self, path: Path) -> bool:
-        """Whether the file is no longer at `path`: deleted or moved, itself or its directory."""
-        try:
-            there = path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            return True
-        return not os.path.samestat(there, os.fstat(self._stream.fileno()))
 
     def close(self) -> None:
         """Write the rest and the summary that lets readers jump to a time."""
         try:
             self.flush()
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
+            self.stream.flush()
+            os.fsync(self.stream.fileno())
         finally:
-            self._stream.close()
+            self.stream.close()
 
     def abandon(self) -> None:
         """Close without writing anything more, after an error."""
         with contextlib.suppress(OSError):
-            self._stream.close()
+            self.stream.close()
 
     def _write_block(self, count: int) -> None:
         block = self._pending[:count]

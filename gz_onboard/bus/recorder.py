@@ -86,7 +86,7 @@ class Recorder:
         self._file_bytes = limits.max_file_bytes
         self._stream: IO[bytes] | None = None  # of the file in use, or of one that is being started
         self._file: LogFile | None = None
-        self._synced_ns: int | None = None
+        self._synced_ns = 0
         self._failed_ns: int | None = None
 
     @property
@@ -120,11 +120,7 @@ class Recorder:
 
     def sync(self, now_ns: int) -> None:
         """Bring everything onto the disk, once in `sync_s`; call it in each round of the main loop."""
-        if self._file is None:
-            return
-        if self._synced_ns is None:
-            self._synced_ns = now_ns
-        if abs(now_ns - self._synced_ns) >= self._limits.sync_s * 1e9:
+        if self._file and abs(now_ns - self._synced_ns) >= self._limits.sync_s * 1e9:
             self._synced_ns = now_ns
             self._write(now_ns, lambda file: self._sync(file, now_ns))
 
@@ -159,11 +155,11 @@ class Recorder:
     def _sync(self, file: LogFile, now_ns: int) -> None:
         file.flush(to_disk=True)
         path = self.paths[-1]
-        if file.vanished(path):
+        if not path.exists():
             self._close_file(file)  # complete, wherever it was moved to
             self._note(OSError(errno.ENOENT, "was deleted or moved while it was written", str(path)), now_ns)
             self._failed_ns = now_ns - self._retry_ns
-        elif file.size() >= self._file_bytes or abs(now_ns - file.start_ns) >= self._limits.max_age_s * 1e9:
+        elif file.stream.tell() >= self._file_bytes or abs(now_ns - file.start_ns) >= self._limits.max_age_s * 1e9:
             self._close_file(file)
         elif not self._delete_oldest(lambda: spare_bytes(self._directory) >= 0):
             self._close_file(file)
@@ -174,7 +170,6 @@ class Recorder:
         self._file = self._stream = None
 
     def _start_file(self, start_ns: int) -> LogFile:
-        self._synced_ns = None
         self._directory.mkdir(parents=True, exist_ok=True)
         self._make_room()
         start = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -187,8 +182,7 @@ class Recorder:
         file = LogFile(self._stream, start_ns, self._metadata, self._attachments)
         for topic, (schema, metadata) in self._channels.items():
             file.channel(topic, schema, metadata)
-        self._failed_ns = None
-        self._file = file
+        self._synced_ns, self._failed_ns, self._file = start_ns, None, file
         return file
 
     def _own(self) -> list[tuple[int, str, Path]]:
@@ -282,6 +276,8 @@ class BackgroundRecorder:
         self._frames: list[Frame] = []  # since they were last handed over
         self._samples: list[tuple[str, int, Mapping[str, object], int | None]] = []
         self._handed_ns = 0
+        self.channel = recorder.channel
+        """As `Recorder.channel`; call it before anything is logged."""
 
     @property
     def error(self) -> str:
@@ -296,10 +292,6 @@ class BackgroundRecorder:
     def lost_frames(self) -> int:
         """Frames not known to be in a file."""
         return self._recorder.lost_frames + self._dropped_frames
-
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """As `Recorder.channel`; call it before anything is logged."""
-        self._recorder.channel(topic, json_schema, metadata)
 
     def frames(self, batch: Sequence[Frame]) -> None:
         """As `Recorder.frames`, later."""
