@@ -20,10 +20,10 @@ RIDE = Path(__file__).resolve().parents[1] / "replay_logs" / "city_14C.blf"
 REPEATS = 3
 PARTS = {
     "battery filter, a step": ("gz_onboard.estimator.battery_pack", "BatteryPack.step"),
-    "speed checks, a step": ("gz_onboard.estimator.plausibility.speeds", "SpeedCheck.step"),
-    "limit checks, a step": ("gz_onboard.estimator.plausibility.limits", "LimitCheck.step"),
+    "speed checks, a step": ("gz_onboard.estimator.plausibility.motion", "SpeedCheck.step"),
+    "limit checks, a step": ("gz_onboard.estimator.plausibility.residual", "LimitCheck.step"),
     "electrical checks, a step": ("gz_onboard.estimator.plausibility.electrical", "PackSensors.read"),
-    "grade checks, a step": ("gz_onboard.estimator.plausibility.grades", "GradeCheck.compare"),
+    "grade checks, a step": ("gz_onboard.estimator.plausibility.motion", "GradeCheck.compare"),
     "forecast": ("gz_onboard.estimator.forecast", "Forecaster.forecast"),
 }
 """Where each part is: a module and a method."""

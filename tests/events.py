@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.plausibility.residual import Sensor
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import STALE_PERIODS, WINDOW, Estimate, Frame, Group, MessageWindow, RoleWindow
 
@@ -73,3 +74,8 @@ class ShownSignals(Signals):
         """Take one sample of each of these roles at `now` [s]; None: nothing comes."""
         shown = [(self._roles.index(role), value) for role, value in values.items() if value is not None]
         self.take([MessageWindow(i, now, 1, (RoleWindow(now, value, 1, value),)) for i, value in shown], now)
+
+
+def faulty(sensors: Mapping[str, Sensor]) -> frozenset[str]:
+    """Roles whose sensors are faulty."""
+    return frozenset(role for role, sensor in sensors.items() if sensor.faulty)

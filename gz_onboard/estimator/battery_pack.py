@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, inf, sqrt
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood, with_wider_soc
@@ -39,6 +39,9 @@ from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery, Health
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import STOOD, Model, standing_load
+
+if TYPE_CHECKING:
+    from gz_onboard.estimator.load_model import PresentLoad
 
 
 @dataclass(frozen=True)
@@ -86,16 +89,6 @@ FIELDS = {
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
 }
 """Of the saved state."""
-
-
-class RidingModel(Protocol):
-    """Quantities of the vehicle that the state of charge depends on; times in s."""
-
-    def power_of_prior(self, now: float) -> float:
-        """Power of the prior riding [W]."""
-
-    def cell_inputs(self, now: float) -> dict[str, float]:
-        """Inputs of effects in the cells, apart from those of the cells themselves."""
 
 
 class Synchroniser:
@@ -195,7 +188,7 @@ class BatteryPack:
         self.is_started = False
         self.past: Past | None = None  # the vehicle when the state was believed last, while waiting
         self.past_age: float | None = None  # s; None: unknown
-        self._now = Past()  # the vehicle at the last step
+        self.vehicle = Past()  # at the last step
         self._unseen = STOOD  # s: for so long, and no longer, the load was not seen
         self._cell = Cell.of(battery, HALF_FULL, BENCH_TEMPERATURE)  # at the last step
         self._v1_lag = 0.0  # V: mean of V1 over the last window less V1 at its end, as voltages are means
@@ -218,11 +211,6 @@ class BatteryPack:
     # --- what others ask --------------------------------------------------------------------------------------
 
     @property
-    def current(self) -> float | None:
-        """Current of the pack at the last step [A]."""
-        return self._now.current
-
-    @property
     def soc(self) -> tuple[float, float]:
         """(state of charge of the cells, its standard deviation), with the belief of the capacity."""
         return self.age.published(self.state)
@@ -240,10 +228,6 @@ class BatteryPack:
     def restarted(self, now: float) -> bool:
         """Whether the filter started again from the voltage a short while ago."""
         return now - self._restarted_at < PACK.restarted_s
-
-    def energy_sd(self, energy: float, slope: float, soc_sd: float) -> tuple[float, float]:
-        """See `PackAge.energy_sd`."""
-        return self.age.energy_sd(self.state, energy, slope, soc_sd)
 
     def learned(self) -> dict[str, LearnedFactor]:
         """Capacity and resistance, by name."""
@@ -268,19 +252,35 @@ class BatteryPack:
 
     def heat(self, temperature: float) -> float:
         """Heat of the pack [W] at the last step's current and `temperature` [degC]; 0 before the first voltage."""
-        if not self.is_started or not self.current:
+        current = self.vehicle.current
+        if not self.is_started or not current:
             return 0.0
         overpotential = self.state.v1 + self.effects.overpotential
-        lost = self._cell.r0 * self.current / self.battery.cells_parallel + overpotential
-        watts = self.battery.cells_series * lost * self.current + self.battery.series_resistance * self.current**2
-        return watts + float(self.battery.reversible_heat(self.current, self.state.soc, temperature))
+        lost = self._cell.r0 * current / self.battery.cells_parallel + overpotential
+        watts = self.battery.cells_series * lost * current + self.battery.series_resistance * current**2
+        return watts + float(self.battery.reversible_heat(current, self.state.soc, temperature))
 
     # --- step by step -----------------------------------------------------------------------------------------
 
     def step(
-        self, now: float, dt: float, reading: PackReading, temperature: float, speed: float | None, riding: RidingModel
+        self,
+        now: float,
+        dt: float,
+        reading: PackReading,
+        temperature: float,
+        speed: float | None,
+        riding: PresentLoad,
+        price: float | None,
     ) -> None:
-        """Advance by `dt` [s] to `now` [s]; temperature: of the cells [degC]; speed in m/s."""
+        """Advance by `dt` [s] to `now` [s].
+
+        temperature: of the cells [degC]; speed in m/s; price: the consumption expected [J/m].
+        """
+        if reading.voltage_doubted and not self._was_doubted and now - self._started < PACK.doubted_start_s:
+            self.state, past, age = self._started_from  # the voltage has misled the filter
+            self._wait(past, age)
+        self._was_doubted = reading.voltage_doubted
+        self._follow_gap(now, dt, reading, temperature, price)
         voltage, current = reading.voltage, reading.current
         if voltage is not None and not self._is_possible(voltage, current or 0.0):
             voltage, reading = None, reading._replace(voltage=None)
@@ -296,7 +296,7 @@ class BatteryPack:
         else:
             if voltage is not None:
                 self._await_first(now, voltage, reading, temperature, speed, riding)
-            self._now = self._now._replace(current=current)
+            self.vehicle = self.vehicle._replace(current=current)
         self._follow_age()
 
     def _follow_age(self) -> None:
@@ -333,19 +333,19 @@ class BatteryPack:
     def _follow_vehicle(self, now: float, dt: float, current: float | None, speed: float | None) -> None:
         """Keep the odometer and the vehicle's own SOC; between two values they continue."""
         own_soc, odometer = self._signals.bms_state_of_charge, self._signals.odometer
-        own, way = self._now.own_soc, self._now.odometer
+        own, way = self.vehicle.own_soc, self.vehicle.odometer
         if odometer.fresh(now):
             way = odometer.value
         elif way is not None:
             way += abs(speed or 0.0) * dt
-        self._now = Past(current, way, own_soc.value if own_soc.fresh(now) else own)
+        self.vehicle = Past(current, way, own_soc.value if own_soc.fresh(now) else own)
 
-    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: RidingModel) -> None:
+    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: PresentLoad) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, state, signals = self.battery, self.state, self._signals
         mean = reading.current or 0.0  # over the window
         if dt > signals.pause:  # of the current meanwhile only the ends are known
-            mean = (mean + (mean if self.current is None else self.current)) / 2
+            mean = (mean + (mean if self.vehicle.current is None else self.vehicle.current)) / 2
             self._cell = Cell.of(battery, state.soc, temperature)
         charge = HOUR * battery.pack_capacity(temperature)
         flowed = mean * dt / charge
@@ -362,8 +362,8 @@ class BatteryPack:
         elif self._reads_zero(now, dt, reading):
             load = self._auxiliary_power / (reading.voltage or self.rest_voltage)
             variance += self._charge_noise.uncounted(load * dt / charge, sqrt(zz))
-        if self._now.own_soc is not None:
-            self._now = self._now._replace(own_soc=self._now.own_soc - flowed)
+        if self.vehicle.own_soc is not None:
+            self.vehicle = self.vehicle._replace(own_soc=self.vehicle.own_soc - flowed)
         v1 = state.v1
         self._advance(dt, mean, variance, temperature)
         self._v1_lag = (v1 - self.state.v1) / 2 if dt <= 2 * WINDOW else 0.0
@@ -512,25 +512,17 @@ class BatteryPack:
         if not past:
             self.age.forget_places()
 
-    def doubt(self, now: float, is_doubted: bool) -> None:
-        """Start again if the voltage is doubted for the first time soon after the start: it has misled the filter."""
-        if is_doubted and not self._was_doubted and now - self._started < PACK.doubted_start_s:
-            self.state, past, age = self._started_from
-            self._wait(past, age)
-        self._was_doubted = is_doubted
-
-    def follow_gap(self, now: float, dt: float, reading: PackReading, temperature: float, price: float | None) -> None:
+    def _follow_gap(self, now: float, dt: float, reading: PackReading, temperature: float, price: float | None) -> None:
         """Start from the state before a gap if it was as long as a restart's: the pack may have been charged meanwhile.
 
-        A gap of all messages, or of the pack's. dt: of this step [s]; temperature: of the cells [degC]; price: the
-        consumption expected [J/m].
+        A gap of all messages, or of the pack's.
         """
         is_blind, is_gap = reading.unmeasured, dt > PRIOR.bridge_s
         if not self.is_started:
             self._gap = None
             return
         if self._gap is None and (is_blind or is_gap):
-            self._gap = now - dt, self.state, self._now._replace(consumption=price)
+            self._gap = now - dt, self.state, self.vehicle._replace(consumption=price)
         if self._gap is None or (is_blind and not is_gap):
             return
         (began, state, past), self._gap = self._gap, None
@@ -554,7 +546,7 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        riding: RidingModel,
+        riding: PresentLoad,
     ) -> None:
         """Start from the first pack `voltage` [V] that holds still, once all that comes once a second is known.
 
@@ -587,7 +579,7 @@ class BatteryPack:
         unsteady_sd = self._span if is_late else PACK.steady_sd * moved
         self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, riding)
 
-    def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: RidingModel) -> None:
+    def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: PresentLoad) -> None:
         """Start from the `first` voltage and the state that was believed."""
         battery, effects, past = self.battery, self.effects, self.past
         power = riding.power_of_prior(now)
@@ -633,9 +625,9 @@ class BatteryPack:
             "soc_variance": state.covariance[0],
             "error_variance": state.covariance[4],
             "v1": state.v1,
-            "current": self._now.current,
-            "odometer": self._now.odometer,
-            "own_soc": self._now.own_soc,
+            "current": self.vehicle.current,
+            "odometer": self.vehicle.odometer,
+            "own_soc": self.vehicle.own_soc,
             "cell_effects": dict(self.effects.states),
         }
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from math import inf, sqrt
 from typing import Any
 
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator import battery_pack, forecast, pack_age, weakest
 from gz_onboard.estimator.battery_filter import SCALAR, Backend
 from gz_onboard.estimator.battery_pack import BatteryPack
@@ -20,8 +21,9 @@ from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import PresentLoad
 from gz_onboard.estimator.motion import MOTION, ActivityTracker, Motion, VibrationMonitor
-from gz_onboard.estimator.plausibility import Plausibility
-from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
+from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading, PackSensors
+from gz_onboard.estimator.plausibility.motion import GradeCheck, SpeedCheck
+from gz_onboard.estimator.plausibility.residual import LimitCheck
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.saved_state import VERSION, Each, Number, Text, check, check_vehicle
 from gz_onboard.estimator.signals import TIMING, Signals
@@ -75,7 +77,8 @@ class Estimator:
     ) -> None:
         self.signals = Signals(groups, battery.window.of_cells)
         p = model.parameters
-        self.motion = Motion(self.signals, p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"])
+        radius, gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
+        self.motion = Motion(self.signals, radius, gear)
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
@@ -86,10 +89,15 @@ class Estimator:
         self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activity, self._reading = ActivityTracker(), PackReading()
         self._distrusted: tuple[str, ...] = ()
-        models = self._cell_error, self._road_power, self._level_power
-        self.plausibility = Plausibility(self.signals, battery, p, model.mass, *models)
+        self.limits = LimitCheck(self.signals)
+        self.speeds = SpeedCheck(self.signals, radius, gear, battery.pack_capacity(BENCH_TEMPERATURE))
+        self.grades = GradeCheck(self.signals, self.speeds, self.limits.altitude, model.mass, self._level_power)
+        self.electrical = PackSensors(self.signals, battery, p, self._cell_error, self._road_power)
+        groups_checked = self.electrical.sensors, self.limits.sensors, self.speeds.sensors
+        self._checked = [sensor for sensors in groups_checked for sensor in sensors.values()]
+        self._checked.append(self.grades.accelerometer)
         self._temperatures = Temperatures(self.signals, p)
-        self.pack = BatteryPack(battery, model, backend, self.signals, self.plausibility.pack.sag)
+        self.pack = BatteryPack(battery, model, backend, self.signals, self.electrical.sag)
         self.forecaster = Forecaster(model, battery, riding, self.pack)
         self.explainer = RangeExplainer(self.forecaster)
         self.route = RouteForecaster(self.forecaster, self.motion, self.signals)
@@ -114,14 +122,13 @@ class Estimator:
         self.gap_time += dt - elapsed
         if self._vibration:
             self._vibration.step(now, signals.accel_z)
-        self.plausibility.limits.step(now, elapsed, motion.speed)
-        self.plausibility.speeds.step(now, elapsed, gap=elapsed < dt)
+        self.limits.step(now, elapsed, motion.speed)
+        self.speeds.step(now, elapsed, gap=elapsed < dt)
         motion.step(now, elapsed)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed, gap=elapsed < dt)
         temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= signals.pause else None)
-        self.pack.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self.forecaster.consumption)
-        self.pack.step(now, dt, self._reading, temperature, motion.speed, self.load)
+        self.pack.step(now, dt, self._reading, temperature, motion.speed, self.load, self.forecaster.consumption)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         if not self.pack.is_started:
@@ -153,8 +160,7 @@ class Estimator:
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """Read voltage and current of the pack by the sensors, else by the model."""
-        reading = self.plausibility.pack.read(now, dt, self.motion.speed, sqrt(self.pack.test.square))
-        self.pack.doubt(now, reading.voltage_doubted)
+        reading = self.electrical.read(now, dt, self.motion.speed, sqrt(self.pack.test.square))
         speed = self.motion.speed
         # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
         rides = speed is not None and abs(speed) > MOVING and dt < self.signals.pause
@@ -176,12 +182,13 @@ class Estimator:
 
     def _compare_grades(self, now: float, dt: float, gap: bool) -> None:
         """Compare the sensors of the grade; forget everything learned from a sensor that is newly distrusted."""
-        grades, reading = self.plausibility.grades, self._reading
+        grades, reading = self.grades, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
         towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
         power = None if voltage is None or current is None or modelled or towed else voltage * current
         grades.compare(now, dt, gap, power)
-        left_out, self._distrusted = self._distrusted, self.plausibility.distrusted
+        left_out = self._distrusted
+        self._distrusted = tuple([sensor.role for sensor in self._checked if sensor.faulty])
         if self._distrusted == left_out:
             return
         changed = set(self._distrusted).symmetric_difference(left_out)
@@ -190,7 +197,7 @@ class Estimator:
         newly = changed.difference(left_out)
         learned = LEARNED_FROM if self.motion.speed is not None else LEARNED_FROM.union(SPEEDS)
         if forgotten := newly & learned:
-            self.forecaster.forget(max(UNLEARNED, self.plausibility.speeds.odometer.compared))
+            self.forecaster.forget(max(UNLEARNED, self.speeds.odometer.compared))
             self.explainer.forget(forgotten)
         if "auxiliary_current" in newly:
             self.forecaster.learner.auxiliaries.forget()
@@ -220,7 +227,7 @@ class Estimator:
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the ride while its consumption is known."""
         speed, reading = self.motion.speed, self._reading
-        unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.plausibility.speeds.disputed
+        unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.speeds.disputed
         known = 0 < dt <= self.signals.pause and not unsure and self._activity.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
             still = 0.0 if dt <= self.signals.pause and self._activity.now is Activity.RIDING else dt
@@ -299,9 +306,9 @@ class Estimator:
     def _reasons(self, now: float) -> int:
         s = self.signals
         reasons = s.missing(now, self._activity.takes_charge or s.carried)
-        if self.plausibility.pack.current_difference.contradicts:
+        if self.electrical.current_difference.contradicts:
             reasons |= Reason.CURRENT_MISMATCH
-        differ = self.plausibility.pack.voltage_dispute or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
+        differ = self.electrical.voltage_dispute or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
         if differ or self.pack.test.mismatch:
             reasons |= Reason.VOLTAGE_MISMATCH
         if self.signals.sampled > TIMING.slowest:

@@ -282,7 +282,9 @@ class Forecaster:
             + (self._cutoff_sd**2 + max(self._empty_sd, left.end_drop_sd) ** 2) * left.by_cutoff**2
         )
         fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
-        of_pack = self._pack.energy_sd(left.energy, left.slope, soc_sd) if self._pack else (fresh, fresh)
+        pack, of_pack = self._pack, (fresh, fresh)
+        if pack:
+            of_pack = pack.age.energy_sd(pack.state, left.energy, left.slope, soc_sd)
         down, up = (sqrt(of_end + sd * sd) for sd in of_pack)
         variance = min(loss_variance + expected.variance, FORECAST.most_sd**2)
         p10, p90 = deciles(left.energy, down, up, variance)

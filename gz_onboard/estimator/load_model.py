@@ -188,7 +188,7 @@ class PresentLoad:
             self._monitor.value(now) if self._monitor else None,
             self._pack.state.soc,
             self._temperatures.cells_or_bench,
-            self._pack.current or 0.0,
+            self._pack.vehicle.current or 0.0,
         )
 
     def power(self, now: float) -> float:

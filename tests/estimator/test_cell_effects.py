@@ -105,4 +105,4 @@ def test_steps_of_the_current_leave_no_error_and_the_sag_that_there_is(monkeypat
         e.handle(event)
     late = np.array([x for x in errors if x is not None][60:])
     assert np.abs(late).max() < 0.006  # in windows with a step
-    assert e.plausibility.pack.sag.ratio == pytest.approx(1.0, abs=0.03)
+    assert e.electrical.sag.ratio == pytest.approx(1.0, abs=0.03)

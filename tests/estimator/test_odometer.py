@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from gz_onboard.estimator.plausibility.residual import faulty
-from gz_onboard.estimator.plausibility.speeds import SpeedCheck
+from gz_onboard.estimator.plausibility.motion import SpeedCheck
 from gz_onboard.events import ROLES, Activity
 from tests.estimator.life import MOTOR, Scooter, estimator, follow
 from tests.estimator.test_plausibility import town
-from tests.events import ShownSignals
+from tests.events import ShownSignals, faulty
 
 RADIUS, GEAR, STEP = 0.25, 0.5, 0.1  # m, 1, s
 Odometer = Callable[[float, float], float | None]

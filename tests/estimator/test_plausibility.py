@@ -9,13 +9,11 @@ import pytest
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.plausibility.electrical import CellError, PackSensors
-from gz_onboard.estimator.plausibility.grades import GradeCheck
-from gz_onboard.estimator.plausibility.limits import LimitCheck
-from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, ResponseGain, faulty
-from gz_onboard.estimator.plausibility.speeds import SpeedCheck, vote
+from gz_onboard.estimator.plausibility.motion import GradeCheck, SpeedCheck, vote
+from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, LimitCheck, ResponseGain
 from gz_onboard.events import ROLES
 from gz_onboard.vehicle import read_vehicle
-from tests.events import ShownSignals
+from tests.events import ShownSignals, faulty
 
 RADIUS, GEAR, CAPACITY = 0.25, 0.5, 30.0  # m; wheel speed over motor speed; Ah
 STEP = 0.1  # s

@@ -8,8 +8,7 @@ from math import exp
 import pytest
 
 from gz_onboard.estimator.battery_priors import Past, uncounted, uncounted_sd
-from gz_onboard.estimator.plausibility.limits import LimitCheck
-from gz_onboard.estimator.plausibility.residual import CONFIG
+from gz_onboard.estimator.plausibility.residual import CONFIG, LimitCheck
 from gz_onboard.events import Activity, Group, Reason, State
 from tests.estimator.life import (
     CELLS,

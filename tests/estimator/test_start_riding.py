@@ -59,4 +59,4 @@ def test_a_series_resistance_that_r0_holds_already_does_not_hide_what_the_curren
         current = 40.0 if i // 20 % 2 else 5.0
         e.handle((i * 0.1, 1, (20.0,)))
         e.handle((i * 0.1 + 0.02, 0, (current, cells.cells_series * (3.75 - r0 * current / cells.cells_parallel))))
-    assert e.plausibility.pack.sag.explained
+    assert e.electrical.sag.explained

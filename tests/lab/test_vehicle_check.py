@@ -13,7 +13,7 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
-from gz_onboard.estimator.plausibility.speeds import GROUND
+from gz_onboard.estimator.plausibility.motion import GROUND
 from gz_onboard.lab.vehicle.charge import check_charge
 from gz_onboard.lab.vehicle.check import check_log, check_text, checks_of
 from gz_onboard.lab.vehicle.electric import (

@@ -8,8 +8,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import EARTH_RADIUS, GRAVITY
+from gz_onboard.estimator.plausibility.motion import AXLE, GROUND, vote
 from gz_onboard.estimator.plausibility.residual import CONFIG
-from gz_onboard.estimator.plausibility.speeds import AXLE, GROUND, vote
 from gz_onboard.events import SPEEDS
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relation, too_little, unit_of

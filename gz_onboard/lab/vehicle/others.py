@@ -9,8 +9,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.units import to_si
 from gz_onboard.constants import KELVIN
-from gz_onboard.estimator.plausibility.limits import LIMITS
-from gz_onboard.estimator.plausibility.residual import CONFIG
+from gz_onboard.estimator.plausibility.residual import CONFIG, LIMITS
 from gz_onboard.events import words
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, rate, relation
