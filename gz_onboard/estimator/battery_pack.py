@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, inf, sqrt
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood, with_wider_soc
@@ -39,9 +39,6 @@ from gz_onboard.events import WINDOW
 from gz_onboard.physics.battery import HALF_FULL, Battery, Health
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import STOOD, Model, standing_load
-
-if TYPE_CHECKING:
-    from gz_onboard.estimator.load_model import PresentLoad
 
 
 @dataclass(frozen=True)
@@ -89,6 +86,16 @@ FIELDS = {
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
 }
 """Of the saved state."""
+
+
+class RidingModel(Protocol):
+    """Quantities of the vehicle that the state of charge depends on; times in s."""
+
+    def power_of_prior(self, now: float) -> float:
+        """Power of the prior riding [W]."""
+
+    def cell_inputs(self, now: float) -> dict[str, float]:
+        """Inputs of effects in the cells, apart from those of the cells themselves."""
 
 
 class Synchroniser:
@@ -269,7 +276,7 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        riding: PresentLoad,
+        riding: RidingModel,
         price: float | None,
     ) -> None:
         """Advance by `dt` [s] to `now` [s].
@@ -340,7 +347,7 @@ class BatteryPack:
             way += abs(speed or 0.0) * dt
         self.vehicle = Past(current, way, own_soc.value if own_soc.fresh(now) else own)
 
-    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: PresentLoad) -> None:
+    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, state, signals = self.battery, self.state, self._signals
         mean = reading.current or 0.0  # over the window
@@ -546,7 +553,7 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        riding: PresentLoad,
+        riding: RidingModel,
     ) -> None:
         """Start from the first pack `voltage` [V] that holds still, once all that comes once a second is known.
 
@@ -579,7 +586,7 @@ class BatteryPack:
         unsteady_sd = self._span if is_late else PACK.steady_sd * moved
         self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, riding)
 
-    def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: PresentLoad) -> None:
+    def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: RidingModel) -> None:
         """Start from the `first` voltage and the state that was believed."""
         battery, effects, past = self.battery, self.effects, self.past
         power = riding.power_of_prior(now)

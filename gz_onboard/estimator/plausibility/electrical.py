@@ -5,7 +5,7 @@ Chooses the voltage and current that the battery filter receives.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum, auto
 from math import hypot, inf, isinf, sqrt
 from typing import NamedTuple
@@ -56,7 +56,7 @@ class PackReading(NamedTuple):
 
 
 ROAD = "road"
-SOURCES = dict(zip(CURRENTS, (CurrentSource.PACK, CurrentSource.INVERTER), strict=False))
+SOURCES = {CURRENTS[0]: CurrentSource.PACK, CURRENTS[1]: CurrentSource.INVERTER, None: CurrentSource.NONE}
 
 
 CellError = Callable[[float, float, str], float]
@@ -198,19 +198,31 @@ class PackSensors:
         flows = any(abs(current) > CONFIG.current_sd_rate * self._capacity for current in currents.values())
         same = self.current_difference.square < CONFIG.agreeing_residual**2
         agree = False if comparable and not against and flows and same else None
-        for role in CURRENTS:
-            if role in self.sensors:
-                sensor = self.sensors[role]
-                sensor.judge(dt, True if sensor in against else agree, disputed)
-        if disputed:
-            return sum(currents.values()) / 2, CurrentSource.DISPUTED
-        if "inverter_current" in currents and not self._signals.auxiliary_current.trusted:
-            currents["inverter_current"] -= extra
+        if auxiliary := self.sensors.get("auxiliary_current"):
+            auxiliary.judge(dt, True if auxiliary in against else agree)
+            if "inverter_current" in currents and not auxiliary.signal.trusted:
+                currents["inverter_current"] -= extra
+        current, role = self._settle(dt, currents, against, agree, disputed)
         if comparable and not (against or own[0].faulty or own[1].faulty):
             self._offset.update(dt, currents["pack_current"] - currents["inverter_current"])
             self._compared = self._signals.pack_current.time
-        source = next((role for role in currents if self._signals[role].trusted), None)
-        return (currents[source], SOURCES[source]) if source else (None, CurrentSource.NONE)
+        return current, CurrentSource.DISPUTED if disputed else SOURCES[role]
+
+    def _settle(
+        self, dt: float, values: dict[str, float], against: Sequence[Sensor], agree: bool | None, disputed: bool
+    ) -> tuple[float | None, str | None]:
+        """Judge the sensors of these `values`: (value to use, the role it is of).
+
+        agree: of those that nothing is `against`. disputed: either may be right, so the mean of the two is used.
+        """
+        for role in values:
+            sensor = self.sensors[role]
+            sensor.judge(dt, True if sensor in against else agree, disputed)
+            sensor.signal.trusted |= disputed
+        if disputed:
+            return sum(values.values()) / 2, None
+        used = next((role for role in values if self._signals[role].trusted), None)
+        return (values[used] if used else None), used
 
     def _choose_voltage(
         self, dt: float, voltages: dict[str, float], current: float | None, idle: bool, innovation_rms: float
@@ -237,14 +249,7 @@ class PackSensors:
             self._model.update(dt, innovation_rms**2)
             for role in VOLTAGES:
                 self._by_cells[role].restart()
-        disputed = self.voltage_dispute > 0
-        for role in cells:
-            sensor = self.sensors[role]
-            sensor.judge(dt, True if sensor in against else agree, disputed)
-            sensor.signal.trusted |= disputed
-        if disputed:
-            return sum(voltages.values()) / 2
-        return next((voltage for role, voltage in voltages.items() if self._signals[role].trusted), None)
+        return self._settle(dt, voltages, against, agree, self.voltage_dispute > 0)[0]
 
     def _voltages_differ(self, dt: float, pack: float, inverter: float) -> bool:
         """Whether two voltages [V per cell] differ by more than one of them moves before the other is sampled."""
