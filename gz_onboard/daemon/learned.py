@@ -101,7 +101,7 @@ def reset(file: Path, vehicle: Vehicle, what: str) -> None:
     new = Pipeline(vehicle).estimator
     with _loaded(file) as (snapshot, age):
         check_vehicle(snapshot, vehicle.key)
-    fresh = {"learned": new.learned_snapshot(), "riding": new.forecaster.snapshot()}
+    fresh = {"learned": new.pack.learned_snapshot(), "riding": new.forecaster.snapshot()}
     changed = {**snapshot, **{part: fresh[part] for part in RESETS[what]}}
     with ExitStack() as held, writing(file):
         folder = os.open(state.copies(file)[0].parent, os.O_RDONLY | os.O_DIRECTORY)

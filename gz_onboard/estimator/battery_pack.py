@@ -15,6 +15,7 @@ from math import exp, inf, sqrt
 from typing import Any, Protocol
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
+from gz_onboard.estimator import pack_age, weakest
 from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood, with_wider_soc
 from gz_onboard.estimator.battery_priors import (
     PRIOR,
@@ -84,6 +85,7 @@ FIELDS = {
     "own_soc": Number(-0.1, 1.1, optional=True),
     "consumption": Number(-1e5, 1e5, optional=True),  # J/m
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
+    "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
 }
 """Of the saved state."""
 
@@ -366,9 +368,12 @@ class BatteryPack:
         if dt > signals.pause or (source is CurrentSource.NONE and reading.unmeasured):
             variance += self._charge_noise.uncounted(uncounted_sd(dt), sqrt(zz))
             self._rest.interrupt()
-        elif self._reads_zero(now, dt, reading):
-            load = self._auxiliary_power / (reading.voltage or self.rest_voltage)
-            variance += self._charge_noise.uncounted(load * dt / charge, sqrt(zz))
+        else:
+            reads_zero = reading.source is CurrentSource.PACK and signals.pack_current.value == 0.0
+            self._zero_time = self._zero_time + dt if reads_zero and signals.contactor.get(now) != 0 else 0.0
+            if self._zero_time > PACK.zero_s:  # many sensors show small currents so
+                load = self._auxiliary_power / (reading.voltage or self.rest_voltage)
+                variance += self._charge_noise.uncounted(load * dt / charge, sqrt(zz))
         if self.vehicle.own_soc is not None:
             self.vehicle = self.vehicle._replace(own_soc=self.vehicle.own_soc - flowed)
         v1 = state.v1
@@ -392,13 +397,6 @@ class BatteryPack:
         state = self._backend.predict(state, share, v1, Noise(variance, error, error_decay, *walks))
         self.state = state = bounded(state)
         self._cell = Cell.of(battery, state.soc, temperature)
-
-    def _reads_zero(self, now: float, dt: float, reading: PackReading) -> bool:
-        """Whether the current has read exactly 0 for long: many sensors show small currents so."""
-        signals = self._signals
-        nothing = reading.source is CurrentSource.PACK and signals.pack_current.value == 0.0
-        self._zero_time = self._zero_time + dt if nothing and signals.contactor.get(now) != 0 else 0.0
-        return self._zero_time > PACK.zero_s
 
     def _update(
         self, now: float, dt: float, measured: tuple[float, float], reading: PackReading, temperature: float
@@ -625,7 +623,7 @@ class BatteryPack:
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """The state and the vehicle, to be kept over a restart; `learned_snapshot` is kept besides."""
+        """The state, the vehicle and what was learned, to be kept over a restart."""
         state = self.state
         return {
             "soc": min(max(state.soc, 0.0), 1.0),
@@ -636,6 +634,7 @@ class BatteryPack:
             "odometer": self.vehicle.odometer,
             "own_soc": self.vehicle.own_soc,
             "cell_effects": dict(self.effects.states),
+            "learned": self.learned_snapshot(),
         }
 
     def learned_snapshot(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from math import inf, sqrt
 from typing import Any
 
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.estimator import battery_pack, forecast, pack_age, weakest
+from gz_onboard.estimator import battery_pack, forecast
 from gz_onboard.estimator.battery_filter import SCALAR, Backend
 from gz_onboard.estimator.battery_pack import BatteryPack
 from gz_onboard.estimator.cells import Temperatures
@@ -64,7 +64,6 @@ FIELDS = {
     "cell_temperature": Number(-50.0, 120.0, optional=True),  # degC
     "gyro_bias": Each(Number(-MOTION.max_gyro_bias, MOTION.max_gyro_bias), 2),  # rad/s, of roll and yaw rate
     "riding": forecast.FIELDS,
-    "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
 }
 """Of the saved state."""
 
@@ -332,12 +331,7 @@ class Estimator:
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": list(self.motion.gyro_bias),
             "riding": self.forecaster.snapshot(),
-            "learned": self.learned_snapshot(),
         }
-
-    def learned_snapshot(self) -> dict[str, Any]:
-        """Return the learned age of the pack, a part of the saved state."""
-        return self.pack.learned_snapshot()
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Continue from a snapshot that is `age` [s] old (None: not known).

@@ -92,12 +92,6 @@ class VoltageBlock:
         self.d, self.u = self.d + d, self.u + drop
         self.dd, self.du, self.uu = self.dd + d * d, self.du + d * drop, self.uu + drop * drop
 
-    @property
-    def scatter(self) -> tuple[float, float, float]:
-        """Sums of the products of deviations from the means [V²]: dd, du, uu."""
-        n = self.count
-        return self.dd - self.d * self.d / n, self.du - self.d * self.u / n, self.uu - self.u * self.u / n
-
 
 @dataclass(frozen=True, slots=True)
 class GroupBelief:
@@ -252,7 +246,9 @@ class WeakestGroup:
     def _learned_from(self, block: VoltageBlock, soc: float) -> GroupBelief | None:
         """The belief after a block; None if no group can have had such voltages."""
         config, n = CONFIG, block.count
-        (dd, du, uu), mean, drop = block.scatter, block.d / n, block.u / n
+        mean, drop = block.d / n, block.u / n
+        # Sums of the products of deviations from the means [V²].
+        dd, du, uu = block.dd - mean * block.d, block.du - mean * block.u, block.uu - drop * block.u
         unexplained = max(dd - du * du / uu, 0.0) if uu > 0 else dd
         noise = config.sample_sd**2 * max(uu, 1e-12)  # V⁴, of the block's response to the load
         if unexplained > (config.jump + config.jump_relative * abs(mean)) ** 2 * n:
