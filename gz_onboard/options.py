@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,36 +48,18 @@ def _json_file(text: str) -> str:
 
 
 def _log(text: str) -> Path:
-    """The log of this name, or behind this URL."""
+    """InputError for a name that no log has."""
     if not text:
         raise InputError("the name of a log is empty")
-    return _fetched(text) if "://" in text else Path(text)
-
-
-@cache
-def _fetched(url: str) -> Path:
-    """The file behind a URL, in a folder that lasts as long as this process. Raises InputError."""
-    import atexit
-    import http.client
-    import tempfile
-    import urllib.request
-
-    if not url.lower().startswith(("http://", "https://", "file://")):
-        raise InputError(f"{url}: only http, https and file are fetched; copy the log to this machine")
-    folder = tempfile.TemporaryDirectory(prefix="gz-onboard-")
-    atexit.register(folder.cleanup)
-    file = Path(folder.name, Path(url.partition("?")[0]).name or "log")
-    try:
-        urllib.request.urlretrieve(url, file)
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise InputError(f"{url}: cannot be fetched: {error}") from None
-    return file
+    if "://" in text:
+        raise InputError(f"{text}: is a URL; fetch the log first, as by curl -O")
+    return Path(text)
 
 
 _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "log": (f"log: {_LOGS}", {"type": _log, "metavar": "LOG"}),
     "logs": (
-        f"logs of rides: {_LOGS}; URLs, or folders of them (CSV files in folders are skipped)",
+        f"logs of rides: {_LOGS}; or folders of them (CSV files in folders are skipped)",
         {"nargs": "+", "type": _log, "metavar": "LOG"},
     ),
     "--vehicle": (

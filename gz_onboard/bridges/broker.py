@@ -5,10 +5,9 @@ Nothing waits for the broker: a message that cannot be sent now is dropped, as i
 
 from __future__ import annotations
 
-import os
 import stat
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +25,10 @@ RETRY_S = 1, 30  # before the first attempt to reconnect, and at most
 CONNECT_S = 5.0  # for the connection itself
 GOODBYE_S = 2.0  # for the last message
 PORT, TLS_PORT = 1883, 8883
-USER, PASSWORD = "GZ_ONBOARD_MQTT_USER", "GZ_ONBOARD_MQTT_PASSWORD"
 
 
-def read_login(file: Path | None, environ: Mapping[str, str] = os.environ) -> tuple[str | None, str | None]:
-    """Read user and password from `file`, or else from `environ`; neither from an empty file.
-
-    InputError if others than the owner may read the file, and for a password without a user.
-    """
-    if file is None:
-        if PASSWORD in environ and USER not in environ:
-            raise InputError(f"{PASSWORD} is set, and {USER} is not")
-        return environ.get(USER), environ.get(PASSWORD)
+def read_login(file: Path) -> tuple[str | None, str | None]:
+    """Read user and password from `file`; neither from an empty one. InputError if others can read it, too."""
     table = Table.read(file)
     if stat.S_IMODE(file.stat().st_mode) & 0o077:
         raise InputError(f"{file}: others can read the password in it: chmod 600 {file}")

@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--name", help="name of the vehicle in topics and in Home Assistant (default: this machine's)")
     tls = "encrypt; FILE: the certificates to trust (default: the system's)"
     add("--tls", nargs="?", const="", metavar="FILE", help=tls)
-    login = "TOML file with user and password (default: $GZ_ONBOARD_MQTT_USER and $GZ_ONBOARD_MQTT_PASSWORD)"
+    login = "TOML file with user and password, which only its owner may read (default: none)"
     add("--login", type=Path, metavar="FILE", help=login)
 
 
@@ -108,7 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     name = arguments.name or re.sub(r"[^\w-]+", "-", socket.gethostname(), flags=re.ASCII) or "scooter"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
         raise InputError(f"--name {name}: must be of letters, digits, - and _, at most 64")
-    topic, login = f"gz-onboard/{name}/state", read_login(arguments.login)
+    topic = f"gz-onboard/{name}/state"
+    login = read_login(arguments.login) if arguments.login else (None, None)
     hello = f"{PREFIX}/device/gz-onboard-{name}/config", encoded(discovery(name, topic))
     will = topic, encoded({"status": "offline"} | dict.fromkeys(SENSORS))
     broker = Broker(arguments.broker, name, hello, will, partial(report, "mqtt"), tls=arguments.tls, login=login)

@@ -123,17 +123,17 @@ def riders_learned(estimator: Estimator) -> dict[str, dict[str, LearnedFactor]]:
     """Return the learned habits by rider and name; the last rider comes first."""
     learner = estimator.forecaster.learner
     riders = {learner.rider: learner.state.habits, **learner.other_riders}
-    return {name: _of_habits(habits, learner.prior) for name, habits in riders.items()}
-
-
-def _of_habits(habits: Habits, prior: Habits) -> dict[str, LearnedFactor]:
-    learned = {}
-    for name, now, before in zip(Habits._fields, habits, prior, strict=True):
-        share = 1 - sqrt(now.level_variance / before.level_variance)
-        learned[name] = LearnedFactor(
-            now.level / before.level, sqrt(now.level_variance) / before.level, max(share, 0.0)
-        )
-    return learned
+    return {
+        rider: {
+            name: LearnedFactor(
+                now.level / prior.level,
+                sqrt(now.level_variance) / prior.level,
+                max(1 - sqrt(now.level_variance / prior.level_variance), 0.0),
+            )
+            for name, now, prior in zip(Habits._fields, habits, learner.prior, strict=True)
+        }
+        for rider, habits in riders.items()
+    }
 
 
 def learned_text(battery: Mapping[str, LearnedFactor], riders: Mapping[str, Mapping[str, LearnedFactor]]) -> str:

@@ -271,25 +271,23 @@ def speed_profile(
     `acceleration` and `deceleration` (all in m/s²), constant between points. Points are the route's and others between
     them.
     """
-    distance = [0.0]
-    curve: list[float] = [abs(route.curvature[0])]
-    limit: list[float] = []  # square of the speed allowed in each interval
-    for i, (d0, d1) in enumerate(pairwise(route.distance)):
-        # Two at least: one interval would be standstill throughout.
-        pieces = max(2, math.ceil((d1 - d0) / CONFIG.profile_step))
-        fixed = min(route.speed_limit[i], top_speed) ** 2
-        for k in range(1, pieces + 1):
-            part = k / pieces
-            distance.append(d0 + part * (d1 - d0) if k < pieces else d1)
-            curve.append(abs(route.curvature[i] + part * (route.curvature[i + 1] - route.curvature[i])))
-            sharpest = max(curve[-2:])
-            limit.append(min(fixed, lateral_acceleration / sharpest if sharpest > 0 else math.inf))
-    square = [0.0, *(min(pair) for pair in pairwise(limit)), 0.0]
-    stops = {d for d, stop in zip(route.distance, route.stop, strict=False) if stop > 0}
-    square = [0.0 if d in stops else v2 for d, v2 in zip(distance, square, strict=True)]
-    lengths = [d1 - d0 for d0, d1 in pairwise(distance)]
+    import numpy as np
+
+    # Two intervals at least between two points: one would be standstill throughout.
+    pieces = np.maximum(np.ceil(np.diff(route.distance) / CONFIG.profile_step).astype(int), 2)
+    points = np.concatenate(([0], np.cumsum(pieces)))  # those of the route among all
+    every = np.arange(points[-1] + 1)
+    distance = np.interp(every, points, route.distance)
+    curvature = np.abs(np.interp(every, points, route.curvature))
+    with np.errstate(divide="ignore"):
+        in_bends = lateral_acceleration / np.maximum(curvature[:-1], curvature[1:])
+    limit = np.minimum(in_bends, np.repeat(np.minimum(route.speed_limit[:-1], top_speed) ** 2, pieces))
+    allowed = np.concatenate(([0.0], np.minimum(limit[:-1], limit[1:]), [0.0]))
+    if route.stop:
+        allowed[points[np.array(route.stop) > 0]] = 0.0
+    square, lengths = allowed.tolist(), np.diff(distance).tolist()  # the square of the speed
     for i, length in enumerate(lengths):
         square[i + 1] = min(square[i + 1], square[i] + 2 * acceleration * length)
     for i, length in reversed(list(enumerate(lengths))):
         square[i] = min(square[i], square[i + 1] + 2 * deceleration * length)
-    return distance, [math.sqrt(v2) for v2 in square]
+    return distance.tolist(), np.sqrt(square).tolist()

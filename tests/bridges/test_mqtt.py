@@ -22,7 +22,7 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.bridges import mqtt
-from gz_onboard.bridges.broker import PASSWORD, USER, Broker, read_login
+from gz_onboard.bridges.broker import Broker, read_login
 from gz_onboard.dashboard import command as dashboard
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import InputError
@@ -203,11 +203,6 @@ def test_user_and_password(tmp_path, monkeypatch):
         login.write_text('user = "rider"\npassword = "secret"\n')
         with bridge(port, "m4", "--login", str(login), monkeypatch=monkeypatch):
             wait_for(lambda: STATE in listener.last, "a state")
-        listener.last.clear()
-        monkeypatch.setenv(USER, "rider")
-        monkeypatch.setenv(PASSWORD, "secret")
-        with bridge(port, "m4", monkeypatch=monkeypatch):
-            wait_for(lambda: listener.last.get(STATE, {}).get("status") == "online", "a state")
 
 
 def test_encrypted(tmp_path, monkeypatch):
@@ -267,13 +262,6 @@ def test_addresses():
     assert str(broker_at("broker.local")) == "the broker broker.local:1883"
     assert str(broker_at("broker", "")) == "the broker broker:8883"
     assert str(broker_at("[::1]:1884")) == "the broker [::1]:1884"
-
-
-def test_a_login_from_the_environment():
-    assert read_login(None, {}) == (None, None)
-    assert read_login(None, {USER: "a", PASSWORD: "secret"}) == ("a", "secret")
-    with pytest.raises(InputError, match="is set"):
-        read_login(None, {PASSWORD: "x"})
 
 
 def test_a_login_that_others_can_read(tmp_path: Path):
