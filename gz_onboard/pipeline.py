@@ -103,7 +103,7 @@ class Pipeline:
         self._ticks = 0  # since a window ended, counted on
         self._windows = 0
         self._range_due = False  # frames of a second that has ended
-        self._dropped_before = self._lost_before = 0
+        self._counted = Counts()  # at the end of a second
         self._recent = Reason(0)
         if log:
             answers = [request.message for request in vehicle.mapping.requests]
@@ -124,16 +124,14 @@ class Pipeline:
         done = 0
         while (tick_ns := self._next_ns) <= until_ns:
             end = bisect_left(frames, (tick_ns,), done)
-            if end > done:
-                self._take(frames[done:end])
-                done = end
+            self._take(frames[done:end])
+            done = end
             if self._ticks % TICKS_PER_WINDOW == 0:
                 self.end_window(self.codec.windows(), self.codec.seconds(tick_ns), tick_ns)
             self._ticks += 1
             self._next_ns += TICK_NS
             out += self.publish(tick_ns)
-        if done < len(frames):
-            self._take(frames[done:])
+        self._take(frames[done:])
         return out
 
     def clock_set(self, delta_ns: int) -> None:
@@ -155,7 +153,10 @@ class Pipeline:
         whole_second = self._windows % WINDOWS_PER_RANGE == 0
         self._windows += 1
         if whole_second:
-            self._count_faults()
+            before, self._counted = self._counted, self.counts()
+            self._recent = Reason.FRAMES_DROPPED if self._counted.dropped > before.dropped else Reason(0)
+            if self._counted.lost > before.lost:
+                self._recent |= Reason.FRAMES_LOST
         self.estimator.step(windows)
         estimate = self.estimator.estimate(now)
         if self._recent or self.extra_reasons:
@@ -178,18 +179,11 @@ class Pipeline:
         assert self.last is not None
         sent = self.publisher.status(self.last, time_ns)
         if self._range_due:
-            sent += self.publisher.range(self.last, self.counts(), time_ns)
+            sent += self.publisher.range(self.last, self._counted, time_ns)
             self._range_due = False
         if self.frame_log:
             self.frame_log.frames(sent)
         return sent
-
-    def _count_faults(self) -> None:
-        counts = self.counts()
-        self._recent = Reason.FRAMES_DROPPED if counts.dropped > self._dropped_before else Reason(0)
-        if counts.lost > self._lost_before:
-            self._recent |= Reason.FRAMES_LOST
-        self._dropped_before, self._lost_before = counts.dropped, counts.lost
 
     def counts(self) -> Counts:
         """Return the counts since the start."""

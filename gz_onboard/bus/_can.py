@@ -102,18 +102,12 @@ class LibraryBus:
             if message is None:
                 return False
             identifier, data = flagged(message), bytes(message.data)
+            if (identifier, data) in self._sent:
+                self._sent.remove((identifier, data))
             # Filtered here: with filters of its own python-can's recv(0) returns None for each frame it rejects.
-            unwanted = self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted
-            if not unwanted and not self._is_echo(identifier, data):
+            elif self._wanted is None or identifier & ~RTR_FLAG in self._wanted:
                 # Only the kernel's time stamps share a clock; other interfaces have clocks of their own.
                 frames.append((time.time_ns(), identifier, data, index))
-        return True
-
-    def _is_echo(self, identifier: int, data: bytes) -> bool:
-        """Whether that is a frame of our own, which comes back once."""
-        if (identifier, data) not in self._sent:
-            return False
-        self._sent.remove((identifier, data))
         return True
 
     def send(self, identifier: int, data: bytes) -> None:

@@ -219,11 +219,9 @@ class MessageDecoder:
     def _physical(self, place: int, column: Column, rows: Sequence[int]) -> list[int]:
         """Those of `rows` whose value is within its limits; the others are counted."""
         signal, (low, high) = self.signals[place], self.limits[place]
-        kept = []
+        kept = [row for row in rows if low <= column[row] <= high]  # not NaN
         for row in rows:
-            if low <= column[row] <= high:  # False for NaN
-                kept.append(row)
-            else:
+            if not low <= column[row] <= high:
                 absent = self.not_available and is_not_available(signal, column[row])
                 self._codec.faults[f"{self.name}.{signal.name}", NOT_AVAILABLE if absent else RANGE] += 1
         return kept

@@ -26,7 +26,7 @@ BLOCK_NS = 1_000_000_000
 MAGIC = MCAP0_MAGIC
 _CHUNK_BYTES = 256 * 1024
 _encode = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode  # `dumps` would make it anew each time
-_Sample: TypeAlias = tuple[int, int, bytes, int]  # log time [ns], channel, data, time of publishing [ns]
+_Sample: TypeAlias = tuple[int, int, bytes, int]  # channel, log time [ns], data, time of publishing [ns]
 
 
 class LogFile:
@@ -87,11 +87,11 @@ class LogFile:
             text = _encode(values)
         except ValueError:
             text = _encode(_without_nan(values))
-        sample = time_ns, self._channels[topic], text.encode(), time_ns if seen_ns is None else seen_ns
+        sample = self._channels[topic], time_ns, text.encode(), time_ns if seen_ns is None else seen_ns
         if self._pending and time_ns > self._pending[0][0]:
             self._held.append(sample)
         else:
-            self._write_sample(sample)
+            self._writer.add_message(*sample)
 
     def note(self, name: str, entries: Mapping[str, str]) -> None:
         """Write a metadata record beside that of the beginning; `name` is another than ``gz_onboard``."""
@@ -128,16 +128,12 @@ class LogFile:
             self._frames_channel, block[0][0], framelog.encode_block(block), publish_time=block[-1][0]
         )
         del self._pending[:count]
-        held, self._held = sorted(self._held, key=itemgetter(0)), []
+        held, self._held = sorted(self._held, key=itemgetter(1)), []
         for sample in held:
-            if self._pending and sample[0] > self._pending[0][0]:
+            if self._pending and sample[1] > self._pending[0][0]:
                 self._held.append(sample)
             else:
-                self._write_sample(sample)
-
-    def _write_sample(self, sample: _Sample) -> None:
-        time_ns, channel, data, seen_ns = sample
-        self._writer.add_message(channel, time_ns, data, seen_ns)
+                self._writer.add_message(*sample)
 
 
 def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
