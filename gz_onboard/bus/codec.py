@@ -28,7 +28,7 @@ from gz_onboard.bus.layout import (
 )
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.bus.origins import Origin, Origins
-from gz_onboard.bus.requests import FUNCTIONAL, INTERRUPTED, MALFORMED, SEQUENCE, AnswerReader, by_response
+from gz_onboard.bus.requests import FUNCTIONAL, INTERRUPTED, MALFORMED, SEQUENCE, answer_readers
 from gz_onboard.events import (
     ERR_FLAG,
     RTR_FLAG,
@@ -274,10 +274,9 @@ class Codec:
             )
             for origin in self.origins
         }
-        responses = by_response(mapping.requests)
-        self._answers = {response: AnswerReader(those, self.faults) for response, those in responses.items()}
+        self._answers = answer_readers(mapping.requests, self.faults)
         self._answering: dict[int, int] = {}  # channel by identifier of an answer: the first, as a gateway may copy it
-        for request in (request for those in responses.values() for request in those):
+        for request in mapping.requests:
             # All ones are a value: what limits are for.
             decoder = MessageDecoder(self, request.message, sources.get(request.name, []), None, False)
             self.decoders[request.name] = decoder

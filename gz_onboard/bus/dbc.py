@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 FARTHEST = 1e30  # of a limit of a signal; some editors write out those of its type
 LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
-_WIDE = re.compile(r"\b(BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)(\s+)(\d{4,9})\b")
+_WIDE = re.compile(r"\b((?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)\s+)(\d{4,9})\b")
+_MESSAGE_NUMBER = re.compile(r"^[ \t]*BO_[ \t]+(\d{4,9})\b", re.M)
 _BUS_LINE = re.compile(r"^[ \t]*BS_[ \t]*:", re.M)
 _BELOW_BUS_LINE = re.compile(r"^[ \t]*(?:BU_[ \t]*:|BO_[ \t]+\d+[ \t]+\w+[ \t]*:)", re.M)
 LONGEST_PROBLEM = 400  # letters of what cantools says, which may quote a whole line
@@ -243,21 +244,13 @@ def _completed(file: Path, text: str) -> str:
     """
     if not _BUS_LINE.search(text) and (below := _BELOW_BUS_LINE.search(text)) and below.start():
         text = f"{text[: below.start() - 1]} BS_:{text[below.start() - 1 :]}"  # it ends the list of NS_
-    wide = []
-
-    def with_bit_31(found: re.Match[str]) -> str:
-        identifier = int(found[3])
-        if not MOST_STANDARD < identifier <= MOST_EXTENDED:
-            return found[0]
-        if found[1] == "BO_" and found.start() == text.rfind("\n", 0, found.start()) + 1:
-            wide.append(identifier)
-        return f"{found[1]}{found[2]}{identifier | EFF_FLAG}"
-
-    text = _WIDE.sub(with_bit_31, text)
+    numbers = dict.fromkeys(_MESSAGE_NUMBER.findall(text))
+    wide = [number for number in numbers if MOST_STANDARD < int(number) <= MOST_EXTENDED]
     if wide:
-        numbers = ", ".join(f"{identifier:#x}" for identifier in wide[:MOST_SAID])
+        text = _WIDE.sub(lambda at: at[1] + str(int(at[2]) | EFF_FLAG) if at[2] in wide else at[0], text)
+        said = ", ".join(f"{int(number):#x}" for number in wide[:MOST_SAID])
         more = f" and {len(wide) - MOST_SAID} more" if len(wide) > MOST_SAID else ""
-        _warn_once(f"{file}: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: {numbers}{more}")
+        _warn_once(f"{file}: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: {said}{more}")
     return text
 
 

@@ -246,9 +246,7 @@ class AnswerReader:
         return [(one, payload[len(one.prefix) :]) for one in self._requests if payload.startswith(one.prefix)]
 
 
-def by_response(requests: Sequence[Request]) -> dict[int, list[Request]]:
-    """The requests by the identifier of their answers."""
-    found: dict[int, list[Request]] = {}
-    for request in requests:
-        found.setdefault(request.response, []).append(request)
-    return found
+def answer_readers(requests: Sequence[Request], faults: Counter[tuple[str, str]]) -> dict[int, AnswerReader]:
+    """A reader for each identifier on which answers to `requests` come."""
+    responses = dict.fromkeys(request.response for request in requests)
+    return {i: AnswerReader([one for one in requests if one.response == i], faults) for i in responses}

@@ -10,7 +10,7 @@ from gz_onboard.bus.codec import LENGTH
 from gz_onboard.bus.layout import MessageSignals, Values
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.origins import Origins
-from gz_onboard.bus.requests import NEGATIVE, AnswerReader, by_response
+from gz_onboard.bus.requests import NEGATIVE, answer_readers
 from gz_onboard.events import Frame
 
 if TYPE_CHECKING:
@@ -33,9 +33,7 @@ class Decoder:
         self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
         self._signals = {message.name: MessageSignals(message, mapping.not_available) for message in messages}
         self._signals |= {request.name: MessageSignals(request.message, not_available=False) for request in requests}
-        self._answers = {
-            response: AnswerReader(those, self._faults) for response, those in by_response(requests).items()
-        }
+        self._answers = answer_readers(requests, self._faults)
         self._asked = {request.request for request in requests}
 
     def decode(self, batches: Iterable[list[Frame]]) -> Iterator[Decoded]:
