@@ -16,6 +16,7 @@ from gz_onboard.bus.layout import crc8_sae_j1850
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.offline.write_logs import write_frames_as
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import Effect, Port
 from gz_onboard.physics.parameters import Parameters, Value
 from gz_onboard.pipeline import TICK_NS, Pipeline
@@ -36,6 +37,11 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def cell_voltage(battery: Battery, soc: float, v1: float, current: float, temperature: float) -> float:
+    """The voltage [V] of a cell at `current` [A] and `temperature` [degC]; v1 [V]: of its RC pair."""
+    return battery.ocv(soc, temperature)[0] - battery.r0.at(soc, temperature)[0] * current - v1
 
 
 def joined(parameters: Parameters, effects: Iterable[Effect]) -> Parameters:

@@ -15,6 +15,7 @@ from gz_onboard.physics.effect import Port
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
+from tests.support import cell_voltage
 
 VEHICLE = read_vehicle("reference", 75.0)
 PACK, P = VEHICLE.pack, VEHICLE.parameters
@@ -32,7 +33,7 @@ def shown(amperes: float) -> float:
     """The pack's voltage [V] after a while at `amperes`: the reaction has settled, what is slower is left at rest."""
     cell = amperes / PACK.cells_parallel
     lost = total([REACTION], all_quantities(cell_current=cell, cell_temperature=COLD))
-    return float(PACK.pack_voltage(PACK.terminal_voltage(SOC, 0.0, cell, COLD)[0] - lost, amperes))
+    return float(PACK.pack_voltage(cell_voltage(PACK, SOC, 0.0, cell, COLD) - lost, amperes))
 
 
 def ride(amperes: float) -> Samples:

@@ -21,8 +21,18 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
 from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.offline.sensors import road_speed
-from gz_onboard.offline.series import all_quantities, ocv_over, over, reversible_heat_over, stepper, total
-from gz_onboard.physics.battery import discharged, heat, terminal_voltage
+from gz_onboard.offline.series import (
+    all_quantities,
+    heat,
+    idle_loss,
+    ocv_over,
+    over,
+    reversible_heat_over,
+    stepper,
+    terminal_voltage,
+    total,
+)
+from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.road import Dynamometer
@@ -103,7 +113,8 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
     for i, (amperes, celsius, shaken, moving) in enumerate(rows):
         cell = amperes / m
         r0, r1, c1 = battery.circuit(soc, celsius)
-        v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
+        decay = np.exp(-0.5 / (r1 * c1))
+        v1 = decay * v1 + (1 - decay) * r1 * cell  # to its middle: what is measured is the second's mean
         half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
         soc -= half
         q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken, "time_moving": moving}
@@ -123,7 +134,7 @@ def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -
     q = all_quantities(motor_current=current, motor_speed=speed, motor_temperature=temperature, torque=torque)
     model, each = vehicle.model, over(1.0)
     motor, inverter = (0.0 * speed + total(model.at(port), q, each) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS))
-    idle = 0.0 * speed + model.idle_loss(q)
+    idle = 0.0 * speed + idle_loss(model, q)
     return motor - idle, idle, inverter
 
 

@@ -1,4 +1,4 @@
-"""The physics over a whole ride in numpy arrays, and the state of charge at its start: for offline tools.
+"""The physics over a whole ride in numpy arrays, and what only offline tools ask of it, such as its first SOC.
 
 Lags, tables and effects give here the values (n,) that their scalar forms in ``physics`` give step by step.
 """
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gz_onboard.arrays import Array
-from gz_onboard.physics.battery import HALF_FULL, Battery, reversible_heat
-from gz_onboard.physics.effect import QUANTITIES, Equation
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear, sqrt
-from gz_onboard.physics.model import STOOD, Bound, Recall
+from gz_onboard.physics.battery import HALF_FULL, Battery, discharged, reversible_heat
+from gz_onboard.physics.effect import QUANTITIES, Equation, Port
+from gz_onboard.physics.functions import Mesh, PiecewiseLinear, exp, sqrt
+from gz_onboard.physics.model import STOOD, Bound, Model, Recall
 
 NEGLIGIBLE = 1e-20  # share of a value that is too small to change it in floating point
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
@@ -144,6 +144,34 @@ def _call(equation: Equation, values: Mapping[str, float], label: str, scope: di
 def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
     """The sum of the values of `effects`: see `Bound`."""
     return sum((effect(quantities, recall) for effect in effects), 0.0)
+
+
+def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> Any:
+    """Voltage [V] under `current` [A]; overpotential [V]: of the RC pair and whatever else relaxes (eq. 2.23)."""
+    return rest - r0 * current - overpotential
+
+
+def heat(rest: Any, terminal: Any, current: Any) -> Any:
+    """Heat [W]: power of the chemistry less that at the terminals (eq. 2.24; as printed it mixes cell and pack).
+
+    Energy that the RC pair's capacitor stores for a minute counts as heat, as in the printed form.
+    """
+    return (rest - terminal) * current
+
+
+def advanced(
+    battery: Battery, dt: float, soc: float, v1: float, current: float, temperature: float
+) -> tuple[float, float]:
+    """(SOC, V1 [V]) of a cell after `dt` [s] at a constant `current` [A] and `temperature` [degC]: eqs. 2.21, 2.22."""
+    _, r1, c1 = battery.circuit(soc, temperature)
+    decay = exp(-dt / (r1 * c1))
+    later = soc - discharged(current, dt, battery.cell_capacity(temperature))
+    return later, decay * v1 + (1 - decay) * r1 * current
+
+
+def idle_loss(model: Model, quantities: Mapping[str, Any]) -> Any:
+    """Loss of the motor [W] turning without current: drag on the shaft, which the motor's current makes up for."""
+    return total(model.at(Port.MOTOR_LOSS), {**quantities, "torque": 0.0, "motor_current": 0.0})
 
 
 def soc_at_load(battery: Battery, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import exp, sqrt
+from math import sqrt
 from typing import Any, TypeVar
 
 from gz_onboard.constants import HOUR, KELVIN
@@ -31,11 +31,6 @@ MOST_SOC_SD = 0.3  # a SOC of which nothing is known lies between 0 and 1: that 
 QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
 
 
-def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> Any:
-    """Voltage [V] under `current` [A]; overpotential [V]: of the RC pair and whatever else relaxes (eq. 2.23)."""
-    return rest - r0 * current - overpotential
-
-
 def discharged(current: Any, dt: Any, capacity: Any) -> Any:
     """The share of SOC that `current` [A] takes in `dt` [s] out of `capacity` [A·h] (eq. 2.21)."""
     return current * dt / (HOUR * capacity)
@@ -45,14 +40,6 @@ def current_of(power: float, source: float, resistance: float) -> float | None:
     """Current [A] that delivers `power` [W] from a `source` [V] behind `resistance` [ohm]; None if none can."""
     root = source * source - 4 * resistance * power
     return None if root < 0 else 2 * power / (source + sqrt(root))
-
-
-def heat(rest: Any, terminal: Any, current: Any) -> Any:
-    """Heat [W]: power of the chemistry less that at the terminals (eq. 2.24; as printed it mixes cell and pack).
-
-    Energy that the RC pair's capacitor stores for a minute counts as heat, as in the printed form.
-    """
-    return (rest - terminal) * current
 
 
 def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
@@ -181,17 +168,6 @@ class Battery:
             return 0.0
         return float(reversible_heat(self.cells_series * self.entropy.at(soc), current, temperature))
 
-    def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:
-        """Heat of the pack [W] at its `current` [A] and `temperature` [degC], with the reversible part.
-
-        overpotential: of a cell [V], of the RC pair and whatever else relaxes.
-        """
-        cell = current / self.cells_parallel
-        volts = self.terminal_voltage(soc, overpotential, cell, temperature)[0]
-        rest = self.cells_series * self.ocv(soc, temperature)[0]
-        lost = heat(rest, self.pack_voltage(volts, current), current)
-        return float(lost + self.reversible_heat(current, soc, temperature))
-
     def soc_at(self, ocv: float, temperature: float | None = None) -> float:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
         if temperature is not None:
@@ -209,25 +185,6 @@ class Battery:
     def pack_voltage(self, cell_voltage: Any, pack_current: Any) -> Any:
         """Voltage at the pack's terminals [V] out of that of the mean cell [V] and pack current [A] (eq. 2.18)."""
         return self.cells_series * cell_voltage - self.series_resistance * pack_current
-
-    def relax(self, dt: float, v1: float, current: float, r1: float, c1: float) -> tuple[float, float]:
-        """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""
-        decay = exp(-dt / (r1 * c1))
-        return decay * v1 + (1 - decay) * r1 * current, decay
-
-    def advanced(
-        self, dt: float, soc: float, v1: float, current: float, temperature: float
-    ) -> tuple[float, float, float]:
-        """(SOC, V1 [V], the factor that V1 decayed by) of a cell after `dt` [s] at a constant `current` [A]."""
-        r1, c1 = self.r1.at(soc, temperature)[0], self.c1.at(soc, temperature)[0]
-        v1, decay = self.relax(dt, v1, current, r1, c1)
-        return soc - discharged(current, dt, self.cell_capacity(temperature)), v1, decay
-
-    def terminal_voltage(self, soc: float, v1: float, current: float, temperature: float) -> tuple[float, float]:
-        """(voltage of a cell [V] at `current` [A] and `temperature` [degC], its derivative over SOC): eq. 2.23."""
-        ocv, slope = self.ocv(soc, temperature)
-        r0, r0_slope = self.r0.at(soc, temperature)
-        return terminal_voltage(ocv, r0, current, v1), slope - current * r0_slope
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
         """The battery as its file has it, with capacity, cut-off and resistances of a vehicle's `parameters`."""

@@ -94,11 +94,6 @@ class Model:
         """The effects at these ports."""
         return [bound for port in ports for bound in self._bound if bound.effect.port is port]
 
-    def idle_loss(self, quantities: Mapping[str, Any]) -> Any:
-        """Loss of the motor [W] turning without current: drag on the shaft, which the motor's current makes up for."""
-        q = {**quantities, "torque": 0.0, "motor_current": 0.0}
-        return sum([effect(q) for effect in self._motor])
-
     def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
         """The ledger [W]: the power that each effect takes out of the pack, by name, moving as `quantities` say.
 

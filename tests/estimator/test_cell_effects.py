@@ -7,9 +7,11 @@ import pytest
 
 from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
+from gz_onboard.offline.series import advanced
 from gz_onboard.physics.battery import Health
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
+from tests.support import cell_voltage
 
 VEHICLE = read_vehicle("reference", 75.0)
 PACK, MODEL = VEHICLE.pack, VEHICLE.model
@@ -83,9 +85,9 @@ def bursts(seconds):
         current = 1.2 if t < 10 or t % 12 > 4 else 60.0
         cell = current / PACK.cells_parallel
         effects.step(PACK, DT, (before + current) / 2 / PACK.cells_parallel, soc, COLD)
-        soc, v1, _ = PACK.advanced(DT, soc, v1, (before + current) / 2 / PACK.cells_parallel, COLD)
+        soc, v1 = advanced(PACK, DT, soc, v1, (before + current) / 2 / PACK.cells_parallel, COLD)
         before = current
-        volts = PACK.pack_voltage(PACK.terminal_voltage(soc, v1, cell, COLD)[0] - effects.overpotential, current)
+        volts = PACK.pack_voltage(cell_voltage(PACK, soc, v1, cell, COLD) - effects.overpotential, current)
         yield t, 0, (volts + p["pack_voltage_offset"], p["pack_current_gain"] * current + p["pack_current_offset"])
         yield t + 0.01, 1, (0.0 if t < 10 else 20.0,)
         if step % 10 == 0:

@@ -16,9 +16,11 @@ from gz_onboard.estimator.battery_priors import bounded
 from gz_onboard.estimator.pack_age import AGE, FIELDS, Belief, PackAge, believe, mixture_variance
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import check
+from gz_onboard.offline.series import advanced
 from gz_onboard.physics.battery import Battery, Health
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
+from tests.support import cell_voltage
 
 PACK = read_vehicle("reference").pack
 DT, WARM = 1.0, 25.0  # s, degC
@@ -72,15 +74,15 @@ def discharge(
     soc, v1, step = 1.0, 0.0, 0
     while soc > until:
         battery, current = aged.battery, 0.9 + 0.7 * math.sin(step / 7) + 0.3 * math.sin(step / 61)
-        soc, v1, _ = truth.advanced(DT, soc, v1, current, WARM)
-        voltage = truth.terminal_voltage(soc, v1, current, WARM)[0]
-        r1, c1 = battery.r1.at(state.soc, WARM)[0], battery.c1.at(state.soc, WARM)[0]
+        soc, v1 = advanced(truth, DT, soc, v1, current, WARM)
+        voltage = cell_voltage(truth, soc, v1, current, WARM)
         charge = current * DT / 3600 / (PACK.capacity * PACK.capacity_share.at(WARM))
         noise = Noise(1e-10, ERROR_VARIANCE, math.exp(-DT / ERROR_TIME), AGE.capacity_walk * charge, 0.0)
-        state = predict(state, charge, battery.relax(DT, state.v1, current, r1, c1)[0], noise)
+        state = predict(state, charge, advanced(battery, DT, state.soc, state.v1, current, WARM)[1], noise)
         state = age.permit(now, reading, signals, state)
         state = age.another_pack(state) or state
-        predicted, h = battery.terminal_voltage(state.soc, state.v1, current, WARM)
+        predicted = cell_voltage(battery, state.soc, state.v1, current, WARM)
+        h = battery.ocv(state.soc)[1] - current * battery.r0.at(state.soc, WARM)[1]
         error, drop = voltage - predicted, battery.r0.at(state.soc, WARM)[0] * current + state.v1
         least = age.least_variance(state, state.soc, battery.ocv(state.soc)[1])
         state = condition(state, (h, -1.0, 0.0), error + state.error, 0.005**2 * 2 * ERROR_TIME, least)

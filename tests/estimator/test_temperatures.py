@@ -6,8 +6,10 @@ import pytest
 
 from gz_onboard.events import Group
 from gz_onboard.offline.cooling import LumpedCooling
+from gz_onboard.offline.series import advanced
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import EventEstimator
+from tests.support import cell_voltage
 
 VEHICLE = read_vehicle("reference", 75.0)
 AMBIENT, CELLS, AMPERES, DT = 5.0, 12.0, 30.0, 0.1  # degC, degC, A, s
@@ -27,9 +29,9 @@ def ridden(vehicle: Vehicle, seconds: float, cells: float = 60.0, air: float = 1
     for step in range(round(seconds / DT)):
         t, current = step * DT, 0.5 if step < 30 else AMPERES
         cell = current / battery.cells_parallel
-        soc, v1, _ = battery.advanced(DT, soc, v1, cell, CELLS)
+        soc, v1 = advanced(battery, DT, soc, v1, cell, CELLS)
         lost = e.pack.effects.overpotential
-        volts = battery.pack_voltage(battery.terminal_voltage(soc, v1, cell, CELLS)[0] - lost, current)
+        volts = battery.pack_voltage(cell_voltage(battery, soc, v1, cell, CELLS) - lost, current)
         if step % 10 == 0 and t < cells:
             e.handle((t, THERMAL, (CELLS,)))
         if step % 10 == 0 and t < air:

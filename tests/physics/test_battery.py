@@ -11,13 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.lab.calibrate.cooling_run import dissipation
-from gz_onboard.offline.series import first_soc, reversible_heat_over, soc_at_load
-from gz_onboard.physics.battery import current_of, heat, terminal_voltage
+from gz_onboard.offline.series import advanced, first_soc, heat, reversible_heat_over, soc_at_load, terminal_voltage
+from gz_onboard.physics.battery import current_of
 from gz_onboard.physics.drawable import DISCHARGE, drawable
 from gz_onboard.physics.effect import Port, load_effect
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import read_vehicle
+from tests.support import cell_voltage
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
@@ -50,9 +51,9 @@ def test_soc_at_inverts_ocv(soc):
 
 @given(st.floats(0.1, 0.95), st.floats(-1, 4), st.floats(0, 40), st.floats(-0.02, 0.05))
 def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
-    voltage = BATTERY.terminal_voltage(soc, v1, current, temperature)[0]
+    voltage = cell_voltage(BATTERY, soc, v1, current, temperature)
     assert soc_at_load(BATTERY, voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
-    voltage = BATTERY.terminal_voltage(soc, 0.0, current, temperature)[0]
+    voltage = cell_voltage(BATTERY, soc, 0.0, current, temperature)
     amperes = BATTERY.cells_parallel * current
     first = first_soc([], BATTERY, (BATTERY.pack_voltage(voltage, amperes), amperes), temperature, 0.0)
     assert first == pytest.approx(soc_at_load(BATTERY, voltage, current, temperature), abs=1e-9)
@@ -63,7 +64,7 @@ def test_what_the_resistors_take_and_the_chemistry_gives_is_the_same_over_a_ride
     for i in [5.0] * 300 + [0.0] * 600:
         r0, r1, _ = BATTERY.circuit(soc, 25.0)
         rest = BATTERY.ocv(soc)[0]
-        soc, later, _ = BATTERY.advanced(0.1, soc, v1, i, 25.0)
+        soc, later = advanced(BATTERY, 0.1, soc, v1, i, 25.0)
         volts = terminal_voltage(rest, r0, i, (v1 + later) / 2)
         parts.append((heat(rest, volts, i), dissipation(r0, r1, i * i, (v1 + later) / 2)))
         v1 = later
@@ -72,31 +73,12 @@ def test_what_the_resistors_take_and_the_chemistry_gives_is_the_same_over_a_ride
     assert parts[0][0] > parts[0][1]
 
 
-@given(st.floats(0.01, 100), st.floats(-0.2, 0.2), st.floats(-10, 10), st.floats(0.005, 0.5), st.floats(100, 5000))
-def test_two_half_steps_make_one_step(dt, v1, current, r1, c1):
-    whole, _ = BATTERY.relax(dt, v1, current, r1, c1)
-    half, _ = BATTERY.relax(dt / 2, v1, current, r1, c1)
-    again, _ = BATTERY.relax(dt / 2, half, current, r1, c1)
-    assert again == pytest.approx(whole, rel=1e-9, abs=1e-12)
-
-
 @given(st.floats(0.05, 0.95), st.floats(-0.1, 0.1), st.floats(-4, 9), st.floats(-10, 45), st.floats(0.02, 100))
 def test_a_cell_advances_by_charge_and_rc_pair(soc, v1, current, temperature, dt):
-    later, after, decay = BATTERY.advanced(dt, soc, v1, current, temperature)
+    later, after = advanced(BATTERY, dt, soc, v1, current, temperature)
     r1, c1 = BATTERY.r1.at(soc, temperature)[0], BATTERY.c1.at(soc, temperature)[0]
     assert later == pytest.approx(soc - current * dt / 3600 / BATTERY.cell_capacity(temperature))
     assert after == pytest.approx(r1 * current + (v1 - r1 * current) * math.exp(-dt / (r1 * c1)))
-    assert decay == pytest.approx(math.exp(-dt / (r1 * c1)))
-
-
-@given(st.floats(0.05, 0.95), st.floats(-4, 9), st.floats(-10, 45))
-def test_terminal_voltage_and_its_slope(soc, current, temperature):
-    voltage, slope = BATTERY.terminal_voltage(soc, 0.02, current, temperature)
-    assert voltage == BATTERY.ocv(soc, temperature)[0] - BATTERY.r0.at(soc, temperature)[0] * current - 0.02
-    if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_curve.x, *BATTERY.r0.soc)):
-        return
-    high, low = (BATTERY.terminal_voltage(soc + h, 0.02, current, temperature)[0] for h in (1e-7, -1e-7))
-    assert slope == pytest.approx((high - low) / 2e-7, rel=1e-3, abs=1e-5)
 
 
 def test_a_mesh_of_one_temperature():
@@ -140,9 +122,7 @@ def discharge(soc, temperature, power, *, burst=1.0, dt=1.0):
         if burst > 1.0 and (mean is None or end / mean < battery.cutoff_voltage * n):
             return energy
         energy += voltage * current * dt
-        v1, _ = battery.relax(
-            dt, v1, current / m, battery.r1.at(soc, temperature)[0], battery.c1.at(soc, temperature)[0]
-        )
+        _, v1 = advanced(battery, dt, soc, v1, current / m, temperature)
         soc -= current * dt / 3600 / battery.pack_capacity(temperature)
 
 

@@ -22,7 +22,7 @@ from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, mesh_over, ocv_over, stepper
+from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.physics.functions import Mesh, PiecewiseLinear
 from gz_onboard.physics.model import air_density
@@ -328,7 +328,7 @@ def test_a_coast_down_is_held_back_as_the_model_says(speed, slope):
     q |= {"ambient_temperature": AMBIENT, "vibration": VEHICLE.riding.vibration}
     q |= {"motor_speed": speed / (P["wheel_radius"] * P["gear_ratio"])}
     model = VEHICLE.model
-    expected = sum(effect(q) for effect in model.at(*ROAD_LOAD)) + model.idle_loss(q) / speed
+    expected = sum(effect(q) for effect in model.at(*ROAD_LOAD)) + idle_loss(model, q) / speed
     assert force == pytest.approx(expected)
 
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.offline.series import bilinear_over, extended_over, relaxation
-from gz_onboard.physics.battery import terminal_voltage
+from gz_onboard.offline.series import bilinear_over, extended_over, relaxation, terminal_voltage
 from gz_onboard.physics.effects import charge_transfer
 
 *FOUND, REACTIONS = charge_transfer.PARAMETERS

@@ -19,7 +19,7 @@ from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.cooling import PERIOD
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import road_speed, true_columns
-from gz_onboard.offline.series import all_quantities, first_soc, total
+from gz_onboard.offline.series import advanced, all_quantities, first_soc, idle_loss, total
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import STOOD, stepping
 from gz_onboard.vehicle import Vehicle
@@ -84,7 +84,7 @@ def bench_run(table: Measurements, vehicle: Vehicle, airflow: float | str = "non
     measured = {name: np.interp(grid, time, table[name]) for name in SENSORS if name in table}
     turning = speed * (np.abs(current) > 1.0)  # the bench's own drive stops with the current
     nothing = np.zeros_like(grid)
-    iron = nothing + vehicle.model.idle_loss({"motor_speed": turning, "motor_temperature": BENCH_TEMPERATURE})
+    iron = nothing + idle_loss(vehicle.model, {"motor_speed": turning, "motor_temperature": BENCH_TEMPERATURE})
     return CoolingRun(
         table.file.name,
         True,
@@ -143,7 +143,7 @@ def ride_run(ride: Samples, vehicle: Vehicle, airflow: float | str = "wheel") ->
         at("ambient_temperature"),
         _air(airflow, _means(*columns["motor_speed"], grid), vehicle),
         _means(time, motor_heat, grid),
-        _means(time, np.zeros_like(time) + vehicle.model.idle_loss(quantities), grid),
+        _means(time, np.zeros_like(time) + idle_loss(vehicle.model, quantities), grid),
         _means(time, inverter_heat, grid),
         pack_heat,
         square,
@@ -204,7 +204,7 @@ def _pack_heat(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
     ):
         r0, r1, _ = battery.circuit(soc, t)
-        soc, v1, _ = battery.advanced(PERIOD, soc, v1, i, t)
+        soc, v1 = advanced(battery, PERIOD, soc, v1, i, t)
         socs[k] = soc
         heat[k] += n * m * dissipation(r0, r1, i2, v1)
         q |= {"cell_current": i, "soc": soc, "cell_temperature": t, "cell_capacity": battery.cell_capacity(t)}

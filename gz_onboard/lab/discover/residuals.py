@@ -19,8 +19,17 @@ from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
 from gz_onboard.offline.arrays import block_means, running_mean
 from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
-from gz_onboard.offline.series import curve_over, first_soc, mesh_over, ocv_over, relaxation, reversible_heat_over
-from gz_onboard.physics.battery import discharged, heat, terminal_voltage
+from gz_onboard.offline.series import (
+    curve_over,
+    first_soc,
+    heat,
+    mesh_over,
+    ocv_over,
+    relaxation,
+    reversible_heat_over,
+    terminal_voltage,
+)
+from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import drag_torque, standing_load

@@ -14,6 +14,7 @@ from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.series import all_quantities, total
 from gz_onboard.physics.model import standing_load
 from gz_onboard.vehicle import read_vehicle
+from tests.support import cell_voltage
 
 SECONDS, COLD, AMPERES, SOC = 120, 5.0, 30.0, 0.15
 
@@ -29,7 +30,7 @@ def mixed() -> MixedModel:
 def ride(mixed: MixedModel) -> Ride:
     """Steady, on a cold and nearly empty pack with its lights on before; as its sensors show it."""
     battery, p = mixed.system.pack, mixed.vehicle.parameters
-    cell, _ = battery.terminal_voltage(SOC, 0.0, AMPERES / battery.cells_parallel, COLD)
+    cell = cell_voltage(battery, SOC, 0.0, AMPERES / battery.cells_parallel, COLD)
     load = standing_load(AMPERES, battery.pack_voltage(cell, AMPERES), p["auxiliary_power"]) / battery.cells_parallel
     settled = [e for e in mixed.system.cells if e.effect.name == "charge_transfer"]  # what is slower is left at rest
     cell -= total(settled, all_quantities(cell_current=load, cell_temperature=COLD))
