@@ -180,9 +180,6 @@ class TwoPairs(CellEffects):
     slow_time: Mesh
     v2 = 0.0
 
-    def __bool__(self) -> bool:
-        return True
-
     def step(
         self,
         battery: Battery,

@@ -254,9 +254,7 @@ class BatteryPack:
         if not self.is_started:
             return None
         current = shown[1] / self.battery.cells_parallel
-        volts = self.battery.cell_voltage(*shown)
-        if self.effects:
-            volts += self.effects.supposed(sensor, now, current)
+        volts = self.battery.cell_voltage(*shown) + self.effects.supposed(sensor, now, current)
         return volts - (self._cell.ocv - self._cell.r0 * current - self.state.v1)
 
     def heat(self, temperature: float) -> float:
@@ -291,9 +289,12 @@ class BatteryPack:
         self._was_doubted = reading.voltage_doubted
         self._follow_gap(now, dt, reading, temperature, price)
         voltage, current = reading.voltage, reading.current
-        if voltage is not None and not self._is_possible(voltage, current or 0.0):
-            voltage, reading = None, reading._replace(voltage=None)
-            self.test.off += 1
+        if voltage is not None:
+            drop = self._cell.r0 * (current or 0.0) / self.battery.cells_parallel + self.effects.overpotential
+            # An inverter that is not yet charged shows a few volts, which no cells can have.
+            if not self._possible[0] < self.battery.cell_voltage(voltage, current or 0.0) + drop < self._possible[1]:
+                voltage, reading = None, reading._replace(voltage=None)
+                self.test.off += 1
         if self.is_started:
             if dt > 0:
                 self._predict(now, dt, reading, temperature, riding)
@@ -333,11 +334,6 @@ class BatteryPack:
                 return
             voltage, current = pair
         self._update(now, dt, (voltage, current), reading, temperature)
-
-    def _is_possible(self, voltage: float, current: float) -> bool:
-        """Whether cells can have a pack `voltage` [V]: an inverter that is not yet charged shows a few volts."""
-        drop = self._cell.r0 * current / self.battery.cells_parallel + self.effects.overpotential
-        return self._possible[0] < self.battery.cell_voltage(voltage, current) + drop < self._possible[1]
 
     def _follow_vehicle(self, now: float, dt: float, current: float | None, speed: float | None) -> None:
         """Keep the odometer and the vehicle's own SOC; between two values they continue."""
@@ -379,9 +375,8 @@ class BatteryPack:
         v1 = state.v1
         self._advance(dt, mean, variance, temperature)
         self._v1_lag = (v1 - self.state.v1) / 2 if dt <= 2 * WINDOW else 0.0
-        if self.effects:
-            inputs = riding.cell_inputs(now)
-            self.effects.step(battery, dt, mean / battery.cells_parallel, self.state.soc, temperature, inputs)
+        inputs = riding.cell_inputs(now)
+        self.effects.step(battery, dt, mean / battery.cells_parallel, self.state.soc, temperature, inputs)
 
     def _advance(self, dt: float, current: float, variance: float, temperature: float) -> None:
         """Predict the state over `dt` [s] at a mean pack `current` [A]; variance: of SOC, by counting."""
@@ -447,8 +442,7 @@ class BatteryPack:
             if reading.reported_current is None:
                 return
             explaining = reading.reported_current
-            if self.effects:
-                lost = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
+            lost = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
         # Both with the resistance outside the cells: of a pack of which little is known, r0 may include it.
         resistance = self._cell.r0 / battery.cells_parallel + battery.series_resistance / battery.cells_series
         self._sag.update(dt, resistance * explaining + lost, -voltage / battery.cells_series)
@@ -532,7 +526,7 @@ class BatteryPack:
             return
         (began, state, past), self._gap = self._gap, None
         if now - began > PRIOR.bridge_s:
-            if self.effects and is_gap:
+            if is_gap:
                 self.effects.step(self.battery, dt, 0.0, state.soc, temperature)
             self.state = state
             self._wait(past, now - began)
@@ -588,7 +582,7 @@ class BatteryPack:
         """Start from the `first` voltage and the state that was believed."""
         battery, effects, past = self.battery, self.effects, self.past
         power = riding.power_of_prior(now)
-        if effects and self._unseen:
+        if self._unseen:
             load = first.current
             if first.moving and not past:
                 before = power / first.voltage / battery.cells_parallel

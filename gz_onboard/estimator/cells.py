@@ -44,7 +44,7 @@ class Cell(NamedTuple):
 
 
 class CellEffects:
-    """The states of the effects. False if the model has none."""
+    """The states of the effects."""
 
     def __init__(self, model: Model, battery: Battery) -> None:
         self._health = battery.health  # at the last step
@@ -55,9 +55,6 @@ class CellEffects:
         self.overpotential = 0.0  # V of a cell: their sum
         self.mean_overpotential = 0.0  # V of a cell, over the last window
         self._supposed: dict[str, Supposed] = {}  # by sensor
-
-    def __bool__(self) -> bool:
-        return bool(self._effects)
 
     def step(
         self,
@@ -108,8 +105,7 @@ class CellEffects:
 
     def rest(self, battery: Battery, seconds: float, soc: float) -> None:
         """So much time [s] without a load, at a temperature that is not known."""
-        if self.states:
-            self.step(battery, seconds, 0.0, soc, MILD)
+        self.step(battery, seconds, 0.0, soc, MILD)
 
 
 class Temperatures:
