@@ -164,7 +164,7 @@ class Pipeline:
             if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
                 estimate.state = State.DEGRADED
         self.last = estimate
-        self.energy.add_estimate(estimate)
+        self.energy.add(estimate)
         if estimate.range is not None and estimate.state in KNOWN:
             self.last_known = estimate
         if self._observer:

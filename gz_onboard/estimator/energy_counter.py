@@ -19,36 +19,21 @@ class EnergyCounter:
         self._longest = longest
         self._before: tuple[float, float] | None = None  # s, m
 
-    def add_estimate(self, e: Estimate) -> None:
-        """Add one estimate; modelled currents do not count."""
+    def add(self, e: Estimate) -> None:
+        """Add the time up to an estimate; modelled currents do not count."""
+        time, distance, voltage = e.time, e.distance, e.pack_voltage
         current = None if e.current_modelled else e.pack_current
-        seen = not (e.speed is None and e.pack_voltage is None and e.pack_current is None)
-        self.add(e.time, e.pack_voltage, current, e.distance, seen=seen, charging=e.activity is Activity.CHARGING)
-
-    def add(
-        self,
-        time: float,
-        voltage: float | None,
-        current: float | None,
-        distance: float = 0.0,
-        *,
-        seen: bool = True,
-        charging: bool = False,
-    ) -> None:
-        """Add the time up to `time` [s], with voltage [V] and current [A, positive discharging] where known.
-
-        distance: since the start [m]; seen: whether anything of the vehicle was known; charging: by a charger.
-        """
         before, way = self._before or (time, distance)
         self._before = time, distance
         dt = time - before
         if not 0 <= dt <= self._longest:
             return
         if voltage is None or current is None:
-            self.missing += dt if seen else 0.0
+            nothing = e.speed is None and voltage is None and e.pack_current is None
+            self.missing += 0.0 if nothing else dt
             return
         energy, self.net = voltage * current * dt, self.net or 0.0
-        if charging:
+        if e.activity is Activity.CHARGING:
             self.charged -= energy
             return
         self.net += energy

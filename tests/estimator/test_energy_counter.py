@@ -12,9 +12,7 @@ def test_a_charger_is_not_riding():
     rides += [(53.0, -10.0, Activity.CHARGING)] * 200 + [(50.0, 8.0, Activity.RIDING)] * 100
     for i, (voltage, current, activity) in enumerate(rides):
         speed = 0.0 if activity is Activity.CHARGING else 10.0
-        energy.add_estimate(
-            Estimate(float(i), speed=speed, pack_voltage=voltage, pack_current=current, activity=activity)
-        )
+        energy.add(Estimate(float(i), speed=speed, pack_voltage=voltage, pack_current=current, activity=activity))
     assert energy.recovered == pytest.approx(10 * 52 * 5)
     assert energy.charged == pytest.approx(200 * 53 * 10)
     assert energy.net == pytest.approx(199 * 50 * 8 - energy.recovered)
@@ -25,6 +23,6 @@ def test_a_log_of_charging_alone_has_energy_nothing():
     """And not something that is not known."""
     energy = EnergyCounter()
     for i in range(11):
-        energy.add(float(i), 53.0, -10.0, charging=True)
+        energy.add(Estimate(float(i), pack_voltage=53.0, pack_current=-10.0, activity=Activity.CHARGING))
     assert (energy.net, energy.recovered) == (0.0, 0.0)
     assert energy.charged == pytest.approx(5300)

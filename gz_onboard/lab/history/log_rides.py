@@ -14,7 +14,7 @@ from typing import Any
 from gz_onboard.bus.publisher import KNOWN
 from gz_onboard.constants import WH
 from gz_onboard.estimator.energy_counter import EnergyCounter
-from gz_onboard.events import Activity, RouteState, State
+from gz_onboard.events import Activity, Estimate, RouteState, State
 from gz_onboard.lab.history.ride import SECOND_NS, KeptRide
 from gz_onboard.lab.logged import Logged, is_estimate, is_number, is_status
 from gz_onboard.log_rows import ESTIMATE_TOPIC, RIDE_UNITS, STATUS_TOPIC, WHY_TOPIC
@@ -66,7 +66,10 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[LogMome
     energy = EnergyCounter(_LONGEST_STEP)
     for topic, time_ns, values in samples:
         if topic == ESTIMATE_TOPIC and is_estimate(values):
-            energy.add(values["time"], values.get("pack_voltage"), values.get("pack_current"), values["distance"])
+            voltage, current = values.get("pack_voltage"), values.get("pack_current")
+            energy.add(
+                Estimate(values["time"], distance=values["distance"], pack_voltage=voltage, pack_current=current)
+            )
             ride = {key: values[key] for key in ("time", "distance")}
             ride |= {
                 "energy": energy.net,

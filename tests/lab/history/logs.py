@@ -78,7 +78,7 @@ def write_log(
                     range_p10=40_000 - distance,
                     range_p90=50_000 - distance,
                 )
-                drawn.add(time, estimate.pack_voltage, estimate.pack_current, distance)
+                drawn.add(estimate)
                 log.sample(ESTIMATE_TOPIC, clock(time), estimate_row(estimate))
                 learned = {
                     "capacity": LearnedFactor(part.capacity, 0.02, 0.5),
