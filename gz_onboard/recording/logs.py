@@ -109,8 +109,10 @@ def read_log(
         (first,) = frames[np.flatnonzero(impossible)[:1]].tuples()
         damage.add("a frame", _problem(first), int(impossible.sum()))
         frames = frames[~impossible]
-    if damage.count:
-        (on_damage or _warn)(damage)
+    if damage.count and on_damage:
+        on_damage(damage)
+    elif damage.count:
+        _LOG.warning("%s", damage)
     return frames.between(start_ns, end_ns)
 
 
@@ -191,19 +193,21 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
     estimate`` wrote. estimates: take that in place of the logs that it is of; None: take both.
     """
     logs: list[Path] = []
+    skipped = (".csv", ESTIMATED) if estimates is False else (".csv",)
     for path in paths:
         if not path.is_dir():
             logs.append(path)
             continue
         files = sorted(file for file in path.rglob("*") if file.is_file() and "/." not in f"/{file.relative_to(path)}")
-        found = [file for file in files if _is_log(file, estimates)]
+        found = [f for f in files if _name(f).endswith(tuple(_READERS)) and not _name(f).endswith(skipped)]
         if estimates:
             made = {
                 file.with_name(file.name.removesuffix(ESTIMATED)) for file in found if file.name.endswith(ESTIMATED)
             }
             found = [file for file in found if file.with_name(log_stem(file)) not in made]
         if not found:
-            table = next((file.relative_to(path) for file in files if _may_be_table(file) and is_table(file)), None)
+            tables = (file for file in files if _name(file).endswith((".csv", ".txt", ".parquet")) and is_table(file))
+            table = next((file.relative_to(path) for file in tables), None)
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
             raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
@@ -220,15 +224,9 @@ def _suffixes() -> str:
     return ", ".join(name for name in _READERS if name.startswith("."))
 
 
-def _may_be_table(file: Path) -> bool:
-    """Whether the name allows a table; the content of any text may look like one."""
-    return file.name.lower().removesuffix(".gz").endswith((".csv", ".txt", ".parquet"))
-
-
-def _is_log(file: Path, estimates: bool | None) -> bool:
-    name = file.name.lower().removesuffix(".gz")
-    other = (".csv", ESTIMATED) if estimates is False else (".csv",)
-    return name.endswith(tuple(_READERS)) and not name.endswith(other)
+def _name(file: Path) -> str:
+    """The name by which a file in a folder is a log or a table."""
+    return file.name.lower().removesuffix(".gz")
 
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
@@ -284,10 +282,6 @@ def _own(damage: LogDamage) -> mcap.LogContents | None:
     """Open a log in our own format; None if it has another. Raises InputError for a missing file."""
     form, data = log_suffix(damage.path), _load(damage.path)
     return mcap.LogContents(unpacked(data, damage), damage) if form == ".mcap" else None
-
-
-def _warn(damage: LogDamage) -> None:
-    _LOG.warning("%s", damage)
 
 
 def _load(path: Path) -> Contents:

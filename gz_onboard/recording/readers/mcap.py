@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zstandard
@@ -45,8 +44,7 @@ _PARSERS: dict[int, Any] = {
 """Of the records that are read whole when a log is opened."""
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """One entry of a topic. times: [ns]; place: the byte at which the chunk that holds it begins."""
 
     channel: Channel

@@ -65,9 +65,9 @@ def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
     """Read a log in the format of `suffix`; what cannot be read is noted as damage."""
     if suffix == ".mf4":
         return _read_mf4(data, damage)
-    beginning = str(data[:_HEAD], "utf-8-sig", "replace")
     if suffix == ".asc":
         return read_lines(data, damage, _asc_parser(), "an ASC log")
+    beginning = str(data[:_HEAD], "utf-8-sig", "replace")
     if suffix == ".trc":
         if not _TRC_START.search(beginning):
             raise InputError(
@@ -176,11 +176,9 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
     The time is rounded to a microsecond: the message's is a float of seconds, which has no more since 1970.
     """
     data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data)
-    channel: Any = message.channel
-    if channel is None:
-        channel = 0
-    elif isinstance(channel, str):
-        channel = (channels if channels is not None else {})[channel]
+    channel: Any = message.channel or 0
+    if isinstance(channel, str):
+        channel = ({} if channels is None else channels)[channel]
     return (
         round(message.timestamp * 1e6) * 1000,
         flagged(message),
@@ -192,16 +190,15 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
 def message_of(frame: Frame) -> can.Message:
     """A frame as a python-can message, the inverse of `frame_of`; more than 8 bytes make it a CAN FD frame."""
     time_ns, identifier, data, channel = frame
-    remote = bool(identifier & RTR_FLAG)
     return can.Message(
         timestamp=time_ns / 1_000_000_000,
         arbitration_id=identifier & MOST_EXTENDED,
         is_extended_id=bool(identifier & EFF_FLAG),
-        is_remote_frame=remote,
+        is_remote_frame=bool(identifier & RTR_FLAG),
         is_error_frame=bool(identifier & ERR_FLAG),
         is_fd=len(data) > 8,
         is_rx=not channel & TRANSMITTED,
         dlc=len(data),
-        data=None if remote else data,
+        data=None if identifier & RTR_FLAG else data,
         channel=channel & ~TRANSMITTED,
     )
