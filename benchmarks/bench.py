@@ -356,7 +356,8 @@ def cost(what: str, root: Path) -> dict[str, float]:
 
 def _environment(root: Path) -> dict[str, str]:
     """The environment in which `root` is the package that Python imports, whatever is installed."""
-    return os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{HERE}"}
+    # With bytecode, as an installed package and the libraries have it.
+    return os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{HERE}", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 @contextlib.contextmanager

@@ -16,7 +16,6 @@ from gz_onboard.recording.frames import FrameColumns
 
 Contents: TypeAlias = bytes | mmap.mmap
 
-_MOST_UNPACKED = 4 << 30  # bytes: it is all in memory
 _UNPACKED_AT_ONCE = 1 << 20  # bytes
 
 
@@ -49,15 +48,10 @@ def unpacked(data: Contents, damage: LogDamage) -> Contents:
     if damage.path.suffix.lower() != ".gz":
         return data
     parts: list[bytes] = []
-    size = 0
     with gzip.GzipFile(fileobj=BytesIO(data)) as stream:
         try:
             while piece := stream.read1(_UNPACKED_AT_ONCE):
                 parts.append(piece)
-                size += len(piece)
-                if size > _MOST_UNPACKED:
-                    damage.add(f"byte {size} of what is packed", f"more than {_MOST_UNPACKED >> 30} GiB; the rest")
-                    break
         except (OSError, EOFError, zlib.error) as error:
             if not parts:
                 raise InputError(f"{damage.path}: not a gzip file ({error})") from None

@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib
 import io
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any, cast
 
 from gz_onboard.bus._can import can, flagged
 from gz_onboard.errors import InputError, shown
@@ -43,22 +42,9 @@ class _TraceReader(can.TRCReader):
         return self._parse_cols(tuple(line.split(maxsplit=self._num_columns)))
 
 
-class _LineFile:
-    """A file of one line, given twice, for python-can's readers, which take the first line for a header."""
-
-    name = ""
-
-    def __init__(self, line: str = "") -> None:
-        self._lines = iter((line, line))
-
-    def __iter__(self) -> Iterator[str]:
-        return self._lines
-
-    def __next__(self) -> str:
-        return next(self._lines)
-
-    def close(self) -> None:
-        """Do nothing: python-can closes its file after each line."""
+def _twice(line: str = "") -> io.StringIO:
+    """A line as a file that has it twice, for python-can's readers, which take the first line for a header."""
+    return io.StringIO(f"{line.rstrip()}\n" * 2)
 
 
 def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
@@ -75,10 +61,10 @@ def read(suffix: str, data: Contents, damage: LogDamage) -> FrameColumns:
                 "begin with '1)'"
             )
         as_read = _as_1_3 if _TRC_1_2.search(beginning) else str
-        parse = _parser(_TraceReader(cast("TextIO", _LineFile())), suffix)
+        parse = _parser(_TraceReader(_twice()), suffix)
         return read_lines(data, damage, lambda line: parse(as_read(line)), "a PCAN trace")
     try:
-        reader = can.CSVReader(cast("TextIO", _LineFile()))
+        reader = can.CSVReader(_twice())
         return read_lines(data, damage, _parser(reader, suffix), "python-can's CSV")
     except InputError:
         raise InputError(
@@ -94,7 +80,7 @@ def _parser(reader: Any, suffix: str) -> Parser:
     header = _HEADERS.get(suffix, ())
 
     def parse(line: str) -> Frame | None:
-        reader.file = _LineFile(line)
+        reader.file = _twice(line)
         is_header = line.lstrip().lower().startswith(header)
         try:
             message = next(iter(reader), None)
@@ -109,7 +95,7 @@ def _parser(reader: Any, suffix: str) -> Parser:
 
 def _asc_parser() -> Parser:
     """Parse lines of an ASC log; where its times are relative, each is that since the line before."""
-    reader = can.ASCReader(cast("TextIO", _LineFile()))
+    reader = can.ASCReader(_twice())
     parse_line, now = _parser(reader, ".asc"), 0.0
 
     def parse(line: str) -> Frame | None:
