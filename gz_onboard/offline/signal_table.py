@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources
-from gz_onboard.bus.units import known_units, to_si
+from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources, known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns

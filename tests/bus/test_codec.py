@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from gz_onboard.bus.codec import CONFLICT, COUNTER, CRC, LENGTH, LONGEST_PAUSE_NS, NOT_AVAILABLE, RANGE, TIME, Codec
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import crc8_sae_j1850, identifiers_of
-from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
-from gz_onboard.bus.units import to_si
+from gz_onboard.bus.mapping import BusMapping, Source, read_mapping, to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
 from gz_onboard.offline.decode_signals import Decoder
 from gz_onboard.toml import Table

@@ -11,8 +11,7 @@ import pytest
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.mapping import BusMapping, pgn, read_mapping
-from gz_onboard.bus.units import known_units, to_si
+from gz_onboard.bus.mapping import BusMapping, known_units, pgn, read_mapping, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
 from gz_onboard.toml import Table

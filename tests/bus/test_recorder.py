@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.background import Background
-from gz_onboard.bus import framelog, logfile
+from gz_onboard.bus import logfile
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.recorder import BackgroundRecorder, LogLimits, Recorder, is_complete
 from gz_onboard.errors import InputError
@@ -91,7 +91,7 @@ def test_another_mcap_reader_finds_topics_schemas_and_json(tmp_path: Path) -> No
         assert (schema.name, schema.encoding, json.loads(schema.data)) == ("Estimate", "jsonschema", SCHEMA)
         assert (channel.message_encoding, channel.metadata) == ("json", {"rate": "1 Hz"})
         assert message.log_time == batches[50][0][0]
-        blocks = [message.data for _, _, message in reader.iter_messages(framelog.TOPIC)]
+        blocks = [message.data for _, _, message in reader.iter_messages(logfile.FRAMES_TOPIC)]
         assert [frame for block in blocks for frame in decode_block(block).tuples()] == flat(batches)
         assert [attachment.name for attachment in reader.iter_attachments()] == ["a.dbc"]
         late = list(reader.iter_messages("/estimate", starting_at=batches[60][0][0]))

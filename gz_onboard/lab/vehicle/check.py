@@ -14,9 +14,8 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.bus.codec import LONGEST_PAUSE_NS, RANGE, Codec
 from gz_onboard.bus.layout import identifier_of
-from gz_onboard.bus.mapping import BusMapping, Source
+from gz_onboard.bus.mapping import UNITS, BusMapping, Source
 from gz_onboard.bus.requests import NEGATIVE
-from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
 from gz_onboard.lab.estimate_tally import PAUSE

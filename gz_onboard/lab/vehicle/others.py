@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.bus.units import to_si
+from gz_onboard.bus.mapping import to_si
 from gz_onboard.constants import KELVIN
 from gz_onboard.estimator.plausibility.residual import CONFIG, LIMITS
 from gz_onboard.events import words

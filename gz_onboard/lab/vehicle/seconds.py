@@ -9,7 +9,7 @@ from math import copysign
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.bus.units import UNITS, known_units, to_si
+from gz_onboard.bus.mapping import UNITS, known_units, to_si
 from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.lab.discover.grid import averaged, measured
 from gz_onboard.lab.discover.stand_ins import delays

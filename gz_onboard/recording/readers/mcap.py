@@ -20,7 +20,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistic
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from gz_onboard.bus import framelog
+from gz_onboard.bus import logfile
 from gz_onboard.errors import InputError
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
 from gz_onboard.recording.readers.contents import Contents, LogDamage
@@ -118,22 +118,22 @@ def read(data: Contents, damage: LogDamage) -> FrameColumns:
     contents = LogContents(data, damage)
     parts = []
     for message in contents.messages():
-        if message.channel.message_encoding == framelog.ENCODING:
+        if message.channel.message_encoding == logfile.BLOCK_ENCODING:
             try:
                 parts.append(decode_block(message.data))
             except ValueError as error:
                 damage.add(f"byte {message.place}", f"a block of frames is broken ({error})")
     channels = contents.channels.values()
-    if channels and framelog.ENCODING not in {channel.message_encoding for channel in channels}:
+    if channels and logfile.BLOCK_ENCODING not in {channel.message_encoding for channel in channels}:
         raise InputError(
-            f"{damage.path}: no raw frames in this MCAP file: it has no topic {framelog.TOPIC} in the encoding"
-            f" {framelog.ENCODING}, but {', '.join(sorted(channel.topic for channel in channels)[:5])}"
+            f"{damage.path}: no raw frames in this MCAP file: it has no topic {logfile.FRAMES_TOPIC} in the encoding"
+            f" {logfile.BLOCK_ENCODING}, but {', '.join(sorted(channel.topic for channel in channels)[:5])}"
         )
     return FrameColumns.concatenate(parts)
 
 
 def decode_block(block: bytes) -> FrameColumns:
-    """Decode the frames of one block, as `framelog.encode_block` made it. Raises ValueError for any other bytes."""
+    """Decode the frames of one block, as `logfile.encode_block` made it. Raises ValueError for any other bytes."""
     if len(block) < _BLOCK_HEAD.size:
         raise ValueError(f"a block of {len(block)} bytes is too short")
     version, width, kinds, count, first, unit = _BLOCK_HEAD.unpack_from(block)
