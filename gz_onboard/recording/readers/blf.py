@@ -69,7 +69,9 @@ def read(data: Contents, damage: LogDamage) -> FrameColumns:
     start_ns, position, promised = _file_start(header[14:22]), header[1], header[12]
     objects, tail, parts = 0, b"", []
     while 0 <= position < len(data):
-        kind, size = _head(data, position)
+        signature, _, _, size, kind = _HEAD.unpack(data[position : position + _HEAD.size].ljust(_HEAD.size, b"\0"))
+        if signature != _SIGNATURE:
+            size = kind = 0
         following = position + size + size % 4
         if kind == _CONTAINER:
             content, whole = _unpack(data, position, min(position + size, len(data)))
@@ -94,14 +96,6 @@ def read(data: Contents, damage: LogDamage) -> FrameColumns:
     if objects < promised and not damage.count:
         damage.add("in the middle", f"{promised - objects} of {promised} objects are missing")
     return FrameColumns.concatenate(parts)
-
-
-def _head(data: Contents, position: int) -> tuple[int, int]:
-    """Type and size of the object at `position`; zeros if there is none."""
-    if position + _HEAD.size > len(data) or data[position : position + 4] != _SIGNATURE:
-        return 0, 0
-    _, _, _, size, kind = _HEAD.unpack_from(data, position)
-    return kind, size
 
 
 def _file_start(fields: tuple[int, ...]) -> int:
