@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import log, pi, sqrt
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 Covariance = tuple[float, float, float, float, float, float, float, float, float, float]
 """Upper triangle of the symmetric 4x4 matrix, row by row: zz, ze, zψ, zρ, ee, eψ, eρ, ψψ, ψρ, ρρ; e in V."""
@@ -126,12 +126,6 @@ def with_soc(state: FilterState, soc: float, variance: float) -> FilterState:
     zz, ze, _, _, ee, _, er, cc, cr, rr = state.covariance
     ze *= sqrt(variance / zz)
     return state._replace(soc=soc, covariance=(variance, ze, 0.0, 0.0, ee, 0.0, er, cc, cr, rr))
-
-
-def with_wider_soc(state: FilterState, variance: float) -> FilterState:
-    """Add `variance` to the state of charge alone."""
-    zz, *others = state.covariance
-    return state._replace(covariance=cast("Covariance", (zz + variance, *others)))
 
 
 def with_wider_capacity(state: FilterState, variance: float) -> FilterState:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator import pack_age, weakest
-from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood, with_wider_soc
+from gz_onboard.estimator.battery_filter import Backend, FilterState, Noise, log_likelihood
 from gz_onboard.estimator.battery_priors import (
     PRIOR,
     ChargeNoise,
@@ -497,7 +497,8 @@ class BatteryPack:
         state = self.state
         if abs(error) < PACK.drop_factor * abs(drop):
             apart = self.battery.soc_at(self.battery.ocv(state.soc)[0] + error) - state.soc
-            self.state = bounded(with_wider_soc(state, apart * apart))
+            wider = state.covariance[0] + apart * apart, *state.covariance[1:]
+            self.state = bounded(state._replace(covariance=wider))
             self.test.blame_model(known)
             return
         self._wait(None, None)

@@ -101,12 +101,6 @@ class GroupBelief:
     rows: tuple[tuple[float, ...], ...]
     blocks: int = 0
 
-    @classmethod
-    def unknown(cls, sds: Sequence[float]) -> GroupBelief:
-        """Of a pack of which nothing is known but these standard deviations."""
-        rows = (tuple(sd * sd if i == j else 0.0 for j in range(len(sds))) for i, sd in enumerate(sds))
-        return cls((0.0,) * len(sds), tuple(rows))
-
     def variance(self, slopes: Sequence[float]) -> float:
         """Variance of the state's sum with these `slopes`."""
         return sum(
@@ -151,6 +145,7 @@ class WeakestGroup:
     def __init__(self, battery: Battery, signals: Signals, parameters: Parameters) -> None:
         self._battery, self._signals, self._signal = battery, signals, signals.lowest_cell_voltage
         offset_sd = hypot(parameters.sd("pack_voltage_offset") / battery.cells_series, CONFIG.channel_sd)
+        self.mapped = bool(self._signal.stale_after)  # whether the vehicle has the signal
         self._prior_sd = (*CONFIG.prior_sd, offset_sd)
         self._above = CONFIG.above + 2 * offset_sd
         self._seen_at = self._steady_since = -inf  # s
@@ -159,14 +154,11 @@ class WeakestGroup:
 
     def begin_anew(self) -> None:
         """Know nothing of the pack: it is another one."""
-        self.known = self._undoubted = GroupBelief.unknown(self._prior_sd)
+        sds = enumerate(self._prior_sd)
+        rows = tuple(tuple(sd * sd if i == j else 0.0 for j in range(len(self._prior_sd))) for i, sd in sds)
+        self.known = self._undoubted = GroupBelief((0.0,) * len(rows), rows)
         self._block, self._doubt, self.refused = VoltageBlock(), 0.0, False
         self.group: WeakGroup | None = None
-
-    @property
-    def mapped(self) -> bool:
-        """Whether the vehicle has the signal."""
-        return bool(self._signal.stale_after)
 
     def learned(self) -> dict[str, LearnedFactor]:
         """Charge when full, capacity and resistance of the weakest group over the mean cell's; by `NAMES`."""
