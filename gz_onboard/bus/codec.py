@@ -289,7 +289,8 @@ class Codec:
         self.received += len(frames)
         if self.origin_ns is None and frames:
             self.origin_ns = self.last_ns = frames[0][0]
-        heard, inboxes, last = -1, dict[int, list[Frame]](), self.last_ns
+        heard, last = -1, self.last_ns
+        inboxes: dict[int, list[Frame]] = {}  # of the channel that is heard
         for frame in frames:
             step = frame[0] - last
             if 0 <= step <= AHEAD_NS:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -42,6 +42,9 @@ class Counts:
     unknown: int = 0
 
 
+COUNTS = {f"RANGE_Count{count.name.capitalize()}": count.name for count in fields(Counts)}  # by signal
+
+
 class Publisher:
     """Encodes estimates by a DBC file, by default `dbc/range.dbc`; its state is the counters of its messages.
 
@@ -63,6 +66,7 @@ class Publisher:
             self._encoders[name] = _Encoder(message, sent)
             self._fields |= self._encoders[name].fields
         self.identifiers = frozenset(self.sent)
+        self._most = {signal: self.greatest(signal) for signal in COUNTS}
         self._status: tuple[Estimate | None, dict[str, int]] = None, {}  # the last that was packed
 
     def may_have_sent(self, frame: Frame) -> bool:
@@ -108,9 +112,7 @@ class Publisher:
                 values["RANGE_WhyRated"] = e.why.reference
                 for i, (cause, size) in enumerate(e.why.largest()[:2], 1):
                     values |= {f"RANGE_WhyCause{i}": cause, f"RANGE_WhyDistance{i}": size}
-        for name, count in vars(counts).items():
-            signal = f"RANGE_Count{name.capitalize()}"
-            values[signal] = min(count, self.greatest(signal))
+        values |= {signal: min(getattr(counts, name), self._most[signal]) for signal, name in COUNTS.items()}
         values |= {signal: 1 for role in e.distrusted if (signal := sensor_signal(role)) in self._fields}
         return self._frames(self._pack(values, [name for name in self.messages if name != STATUS]), time_ns)
 
@@ -162,6 +164,7 @@ def sensor_signal(role: str) -> str:
     return "RANGE_Bad" + "".join(word.capitalize() for word in role.split("_"))
 
 
+@cache
 def reason_signal(reason: Reason) -> str:
     """The signal that carries `reason`: NO_IMU is RANGE_NoImu."""
     return "RANGE_" + "".join(word.capitalize() for word in str(reason.name).split("_"))
