@@ -269,7 +269,12 @@ def hour_plain(repeats: int, seconds: float, *options: str) -> tuple[float, floa
         with tempfile.TemporaryDirectory() as name:
             command = [sys.executable, "-m", "plain", "offline", str(RIDE), f"{name}/plain.mcap"]
             text = subprocess.run(
-                [*command, "--seconds", str(seconds), *options], check=True, stdout=subprocess.PIPE, text=True, cwd=HERE
+                [*command, "--seconds", str(seconds), *options],
+                check=True,
+                stdout=subprocess.PIPE,
+                text=True,
+                env=_environment(ROOT),
+                cwd=HERE,
             ).stdout
         rows.append(json.loads(text))
     per_second = median(row["cpu"] / row["seconds"] for row in rows)
