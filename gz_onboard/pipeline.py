@@ -88,7 +88,7 @@ class Pipeline:
         )
         self.publisher = range_publisher(vehicle)
         self.kernel_lost = 0  # frames; set by the daemon
-        self.overrun = 0  # frames left out because more came than can be decoded; set by the daemon
+        self.overrun = 0  # frames that the daemon left out; set by the daemon
         self.log_lost = 0  # frames that are in no log; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed

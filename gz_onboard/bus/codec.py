@@ -60,8 +60,8 @@ LONGEST_PAUSE_NS = 30 * 86_400 * 1_000_000_000
 """Of a log: a leap ahead by more is a clock that was set. A live bus may be silent for as long as it likes."""
 PAUSE = 1.0  # s: after it any counter goes, where the period of a message is not known
 CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
-MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
-_MOST_LEAPS = 100  # are remembered
+MOST_IDENTIFIERS = 4096  # that are remembered: a babbling node must not fill the memory
+_MOST_LEAPS = 100  # of the clock, that are remembered
 _IDENTIFIER = itemgetter(1)
 
 
@@ -110,7 +110,7 @@ class MessageDecoder:
         elif self.origin:
             self.origin.last = frames[-1], origin_ns
         if frames:
-            frames, data = self._right(frames, origin_ns)
+            frames, data = self._intact(frames, origin_ns)
         if not frames:
             return None
         self._codec.latest[self.name] = frames[-1]
@@ -130,8 +130,8 @@ class MessageDecoder:
                 self._codec.copies += 1
         return own
 
-    def _right(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
-        """Those of `frames` whose length, checksum and counter are right, and the data of all of them."""
+    def _intact(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
+        """Drop frames with a wrong length, checksum or counter; return the others, and their data in one piece."""
         length, protection, faults = self.message.length, self.protection, self._codec.faults
         parts = [frame[2] for frame in frames]
         if set(map(len, parts)) != {length}:
@@ -217,7 +217,7 @@ class MessageDecoder:
         return MessageWindow(self.group or 0, last_ns * 1e-9, count, tuple(roles))
 
     def _physical(self, place: int, column: Column, rows: Sequence[int]) -> list[int]:
-        """Those of `rows` whose value is within its limits; the others are counted."""
+        """Keep the `rows` whose value is within its limits, and count the others."""
         signal, (low, high) = self.signals[place], self.limits[place]
         kept = [row for row in rows if low <= column[row] <= high]  # not NaN
         for row in rows:

@@ -66,7 +66,7 @@ class Daemon:
         self._keeper = StateKeeper(state_file, vehicle.key) if state_file else None
         self._stopping = False
         self._later: list[Frame] = []  # read before their tick
-        self._overrun = 0  # frames left out
+        self._overrun = 0  # frames left out: too many, or stamped while the clock was set
         self._frame_s = FRAME_S
         self._offset = _wall_offset()
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
@@ -157,6 +157,7 @@ class Daemon:
         if abs(step) > CLOCK_STEP_NS:  # the network or GPS set the clock; frames have the old or the new time
             log.warning("the clock was set by %.1f s", step * 1e-9)
             self.pipeline.clock_set(step)
+            self._overrun += len(frames) + len(self._later)
             frames, self._later = [], []
         kept = fair_share(frames, max(int(WORK_S / self._frame_s), 2 * BUSY))
         self._overrun += len(frames) - len(kept)
@@ -287,7 +288,7 @@ class StateKeeper:
 def foreign_text(pipeline: Pipeline) -> str:
     """Warn of another sender on the identifiers of our own frames."""
     found = ", ".join(pipeline.foreign)
-    return f"someone else sends on the identifiers of the range frames ({found}): give others, by range_identifier"
+    return f"someone else sends on the identifiers of the range frames ({found}): choose others by range_identifier"
 
 
 def fair_share(frames: list[Frame], most: int) -> list[Frame]:

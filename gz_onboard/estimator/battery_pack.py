@@ -101,7 +101,7 @@ class RidingModel(Protocol):
 
 
 class Synchroniser:
-    """Keeps the one that comes first, and interpolates it. `latency` [s]: of the voltage; negative: of the current."""
+    """Pairs voltages with the current of the same time. latency: of the voltage [s]; negative: of the current."""
 
     def __init__(self, latency: float) -> None:
         self.latency = latency

@@ -113,7 +113,7 @@ class Estimator:
         now = max(self._time or 0.0, *(window.time for window in windows))
         signals, motion = self.signals, self.motion
         signals.take(windows, now)
-        dt = self._elapsed(now)
+        dt = self._time_passed(now)
         if dt is None:
             return
         self._time = now
@@ -135,10 +135,11 @@ class Estimator:
         elif self.forecaster.due(now):
             self._look_ahead(now, temperature)
 
-    def _elapsed(self, now: float) -> float | None:
-        """The time since the last step [s], less what the clock was set by; None until the odometer shows which it was.
+    def _time_passed(self, now: float) -> float | None:
+        """Measure the time since the last step [s] without leaps of the clock; None while it cannot be told yet.
 
-        A vehicle that moves at both ends of a gap has moved during it, and its odometer has counted the distance.
+        A gap during which the odometer did not move, although the vehicle moved before and after it, is a leap of the
+        clock. The step waits until the odometer has come. Also updates the motion to the speed behind the gap.
         """
         dt = 0.0 if self._time is None else now - self._time
         odometer, speed = self.signals.odometer, self.motion.speed or 0.0
@@ -210,8 +211,8 @@ class Estimator:
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
         capacity = self.pack.battery.pack_capacity(self._temperatures.cells_or_bench)
         rate, drive = (None if x is None else x / capacity for x in (known, signals.inverter_current.get(now)))
-        rides = abs(self.motion.speed or 0.0) > MOVING  # then nobody asks
-        silent = not rides and bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
+        is_moving = abs(self.motion.speed or 0.0) > MOVING  # and so is switched on, whatever is silent
+        silent = not is_moving and bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.motion.speed or 0.0) < MOTION.standstill:

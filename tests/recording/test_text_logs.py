@@ -78,7 +78,7 @@ def test_savvycan_lines_that_are_none_are_counted_and_the_first_named(tmp_path):
 
 
 def test_a_savvycan_header_over_something_else_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"line 2: not a line of SavvyCAN's CSV.*'hello'"):
+    with pytest.raises(InputError, match=r"line 2: cannot be read as SavvyCAN's CSV.*'hello'"):
         frames_of(tmp_path, f"{SAVVYCAN}hello\nworld\n", "r.csv")
 
 

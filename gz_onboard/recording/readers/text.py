@@ -57,7 +57,7 @@ def read_lines(
                 except ValueError as error:
                     damage.add(f"line {at}", f"{error}: {shown(line.strip()[:60])}")
             if damage.count and not frames and not parts:
-                raise InputError(f"{damage.path}, {damage.place}: not a line of {name}: {damage.reason}")
+                raise InputError(f"{damage.path}, {damage.place}: cannot be read as {name}: {damage.reason}")
         if frames:
             parts.append(FrameColumns.of(frames))
         number += text.count("\n")
