@@ -310,7 +310,7 @@ class BatteryPack:
         self._follow_age()
 
     def _follow_age(self) -> None:
-        """Make another `battery` if its age is believed to be another."""
+        """Replace `battery` when the belief of its age has changed."""
         health = Health(self.age.health.capacity, self.age.health.resistance, self.weakest.group)
         if health != self.battery.health:
             self.battery = self._filed.aged(health)
@@ -405,7 +405,7 @@ class BatteryPack:
         self.state = state = self.age.permit(now, reading, self._signals, self.state)
         if replaced := self.age.another_pack(state):
             self.state = state = replaced
-            self.weakest.begin_anew()
+            self.weakest.forget()
         if dt <= self._signals.pause and self._take_rest(dt, shown, current, reading, temperature):
             return
         state = self.state

@@ -17,7 +17,7 @@ from gz_onboard.physics.parameters import Parameters
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
-FORGOTTEN = 10.0  # s: a current that nobody asked for in so long is followed anew
+FORGOTTEN = 10.0  # s: a current that was not asked for in this time is followed from the start again
 CELL_SENSOR_SD_K, CELL_MODEL_SD_K = 1.0, 8.0
 
 
@@ -65,7 +65,7 @@ class CellEffects:
         temperature: float,
         others: Mapping[str, float] | None = None,
     ) -> None:
-        """`dt` [s] on at a mean cell `current` [A], `temperature` in degC; others: what else has changed, by name."""
+        """Advance by `dt` [s] at a mean cell `current` [A] and `temperature` [degC]; others: more quantities, by name."""
         q, self._health = self._quantities, battery.health
         q.update(others or {})
         q["soc"], q["cell_temperature"] = soc, temperature
@@ -77,8 +77,8 @@ class CellEffects:
     def supposed(self, sensor: str, now: float, current: float) -> float:
         """`mean_overpotential` [V] at `now` [s] if the cell's `current` [A] by `sensor` flows.
 
-        It has its own memory from when it is first asked for: what has just begun has not built up yet, and what has
-        long been another is settled.
+        Each sensor has a memory of its own, from when it is first asked for: the effects of a current that has just
+        changed have not built up yet, those of an old one have settled.
         """
         then, states = self._supposed.get(sensor, (now, self.states))
         if not 0 <= now - then < FORGOTTEN:
@@ -104,7 +104,7 @@ class CellEffects:
         self.rest(battery, FOREVER if age is None else age, soc)
 
     def rest(self, battery: Battery, seconds: float, soc: float) -> None:
-        """So much time [s] without a load, at a temperature that is not known."""
+        """Advance by `seconds` [s] without a load, at an unknown temperature."""
         self.step(battery, seconds, 0.0, soc, MILD)
 
 

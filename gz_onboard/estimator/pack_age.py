@@ -133,7 +133,7 @@ def _quantile(share: float, kinds: tuple[tuple[float, float, float], ...]) -> fl
 
 
 class PackAge:
-    """Follows one pack's age: takes the filter's state and returns it. `health`: the age as it is believed."""
+    """Follows one pack's age: takes the filter's state and returns it. `health`: the age as believed now."""
 
     def __init__(self, battery: Battery, backend: Backend) -> None:
         self._battery, self._backend = battery, backend

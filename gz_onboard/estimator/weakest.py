@@ -150,10 +150,10 @@ class WeakestGroup:
         self._above = CONFIG.above + 2 * offset_sd
         self._seen_at = self._steady_since = -inf  # s
         self._steady_at = inf  # V about which the mean cell's voltage has held since
-        self.begin_anew()
+        self.forget()
 
-    def begin_anew(self) -> None:
-        """Know nothing of the pack: it is another one."""
+    def forget(self) -> None:
+        """Forget what was learned: the pack has been replaced."""
         sds = enumerate(self._prior_sd)
         rows = tuple(tuple(sd * sd if i == j else 0.0 for j in range(len(self._prior_sd))) for i, sd in sds)
         self.known = self._undoubted = GroupBelief((0.0,) * len(rows), rows)
@@ -191,7 +191,7 @@ class WeakestGroup:
         soc: tuple[float, float],
         overpotential: float,
     ) -> None:
-        """Take in the window that ends at `now` [s]; temperature: of the cells [degC].
+        """Learn from the window that ends at `now` [s]; temperature: of the cells [degC].
 
         battery: with its age. soc: of the mean cell, and its sd; overpotential: beyond the drop over its R0 [V].
         """
@@ -229,7 +229,7 @@ class WeakestGroup:
             self.known = learned
         behind, sd = self.known.behind(1 - soc)
         if self.known.blocks >= CONFIG.proven and soc - behind + 2 * sd < -CONFIG.past_empty:
-            self.begin_anew()
+            self.forget()
             self.refused, self._doubt = True, 1.0
         if self._doubt < CONFIG.trusted_below:
             self._undoubted = self.known

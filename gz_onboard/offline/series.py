@@ -1,4 +1,4 @@
-"""The physics over a whole ride in numpy arrays, and what only offline tools ask of it, such as its first SOC.
+"""The physics over a whole ride in numpy arrays, and quantities that only offline tools need, such as the first SOC.
 
 Lags, tables and effects give here the values (n,) that their scalar forms in ``physics`` give step by step.
 """

@@ -202,7 +202,7 @@ class Battery:
         )
 
     def aged(self, health: Health) -> Battery:
-        """The pack as it is when it has aged so."""
+        """Return the pack aged to `health`."""
         r = health.resistance / self.health.resistance
         r0, r1, c1 = self.r0.scaled(r), self.r1.scaled(r), self.c1.scaled(1 / r)  # the time constant stays
         return replace(self, r0=r0, r1=r1, c1=c1, health=health)

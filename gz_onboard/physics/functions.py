@@ -111,7 +111,7 @@ class Mesh:
         return value + slope * (soc - start), slope
 
     def scaled(self, factor: float) -> Mesh:
-        """Another mesh, of this one's values times `factor`."""
+        """Return a mesh with all values multiplied by `factor`."""
         values = tuple(tuple(factor * v for v in row) for row in self.value)
         return Mesh(self.soc, self.temperature, values, self.geometric)
 

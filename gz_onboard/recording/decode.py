@@ -319,7 +319,7 @@ def _edges(number: NDArray[np.int64]) -> NDArray[np.int64]:
 def _role_windows(
     column: _RawColumn, part: slice, number: NDArray[np.int64], time_ns: NDArray[np.int64], known: NDArray[np.int64]
 ) -> list[RoleWindow | None]:
-    """What a signal showed in each of the windows `known`; None if nothing.
+    """The samples of a signal in each of the windows `known`; None where there are none.
 
     part: of its message's frames; number, time_ns: of the window of each of them, and when it came.
     """

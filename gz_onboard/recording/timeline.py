@@ -16,9 +16,9 @@ _DENSE = 20  # frames without a gap: a bus that sends as many does not end in a 
 def stray(time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Mask of the few frames whose time is ahead of all others.
 
-    Up to two frames after a gap are that if a frame behind them continues from before the gap, and so are those in
-    which a log ends after many frames without a gap. Longer leaps, and leaps back, are left to `on_timeline`. On a
-    live bus, where nobody can wait, the codec takes such a frame for a gap.
+    One or two frames after a gap are stray if the next frame continues from before the gap, or if the log ends with
+    them after many frames without a gap. Longer leaps, and leaps back, are left to `on_timeline`. On a live bus, where
+    nobody can wait, the codec takes such a frame for a gap.
     """
     found = np.zeros(len(time_ns), bool)
     steps = np.diff(time_ns)

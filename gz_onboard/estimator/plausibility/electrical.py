@@ -39,14 +39,14 @@ class CurrentSource(Enum):
 
 
 class PackReading(NamedTuple):
-    """Voltage [V] and current [A] of the pack; None where no sensor is to be believed."""
+    """Voltage [V] and current [A] of the pack; None where no sensor can be trusted."""
 
     voltage: float | None = None
     current: float | None = None
     source: CurrentSource = CurrentSource.NONE
     reported_current: float | None = None  # A, trusted or not
     voltage_sd: float = 0.0  # V of a cell
-    current_apart: float | None = None  # A: by so much the two currents differ in the mean; None: only one is known
+    current_apart: float | None = None  # A: mean difference of the two currents; None: only one is known
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
 
     @property

@@ -207,7 +207,7 @@ _MICROSECOND_NS = 1000  # unit of stamps without a decimal point
 
 
 def read_savvycan(data: Contents, damage: LogDamage) -> FrameColumns:
-    """Read SavvyCAN's CSV; lines that are none are noted as damage.
+    """Read SavvyCAN's CSV; other lines are noted as damage.
 
     Columns: time stamp, identifier, extended, direction (not in the older form), bus, length, bytes.
     """
