@@ -65,7 +65,7 @@ class CellEffects:
         temperature: float,
         others: Mapping[str, float] | None = None,
     ) -> None:
-        """Advance by `dt` [s] at a mean cell `current` [A] and `temperature` [degC]; others: more quantities, by name."""
+        """Advance by `dt` [s] at a mean cell `current` [A] and `temperature` [degC]; others: quantities by name."""
         q, self._health = self._quantities, battery.health
         q.update(others or {})
         q["soc"], q["cell_temperature"] = soc, temperature
