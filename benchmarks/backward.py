@@ -14,9 +14,9 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import MILD
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.model import air_density
 from gz_onboard.offline.series import all_quantities, over
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.model import air_density
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -289,7 +289,7 @@ def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
 
     The daemon's own pipeline and recorder, called as its loop calls them, at the ride's times.
     """
-    from gz_onboard.bus.recorder import Recorder
+    from gz_onboard.can.recorder import Recorder
     from gz_onboard.daemon.loop import TICK
     from gz_onboard.pipeline import Pipeline, dbc_texts
     from gz_onboard.recording.logs import read_frames

@@ -53,7 +53,7 @@ def pipeline() -> dict[str, float]:
 
 def _frames() -> list[Any]:
     """The frames of the recorded ride."""
-    for module in ("gz_onboard.recording.logs", "gz_onboard.bus.logs"):  # the latter in older commits
+    for module in ("gz_onboard.recording.logs", "gz_onboard.can.logs"):  # the latter in older commits
         with contextlib.suppress(ImportError):
             return [frame for batch in importlib.import_module(module).read_frames(RIDE) for frame in batch]
     raise ImportError("this checkout has no reader of logs")

@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.constants import KELVIN, WH
-from gz_onboard.physics.effect import BASE_EFFECTS
-from gz_onboard.physics.functions import PiecewiseLinear
+from gz_onboard.model.effect import BASE_EFFECTS
+from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter

@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--only Cycle_1] [--board] [--write docs/real-cell.md]
 
 Data: Kollmeyer, "Panasonic 18650PF Li-ion Battery Data", Mendeley Data 2018, doi:10.17632/wykht8y7tg.1, as Parquet and
-1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.lab.calibrate`; the
+1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.calibrate`; the
 filter is that of the on-board estimator, fed with events once a second; the drive cycles are used for nothing else.
 """
 
@@ -20,19 +20,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.calibrate import ocv, pulse
+from gz_onboard.calibrate.cell_circuit import Circuit, voltage
+from gz_onboard.calibrate.result import Found, Result
+from gz_onboard.calibrate.table import Measurements, Named, read_table
 from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.estimator.battery_priors import PRIOR
 from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
-from gz_onboard.lab.calibrate import ocv, pulse
-from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
-from gz_onboard.lab.calibrate.result import Found, Result
-from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effects import charge_transfer, slow_relaxation
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.parameters import Parameters
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.effects import charge_transfer, slow_relaxation
+from gz_onboard.model.functions import Mesh, PiecewiseLinear
+from gz_onboard.model.model import Model
+from gz_onboard.model.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 

@@ -31,10 +31,10 @@ class StandIn(socket.socket):
 def install(receive_port: int, send_port: int, library: bool) -> None:
     """From now on a SocketCAN bus receives on one port of 127.0.0.1 and sends to the other; library: python-can's."""
     if library:
-        importlib.import_module("gz_onboard.bus._can")  # python-can without what makes it large
+        importlib.import_module("gz_onboard.can._can")  # python-can without what makes it large
         module = importlib.import_module("can.interfaces.socketcan.socketcan")
     else:
-        module = importlib.import_module("gz_onboard.bus.channel")
+        module = importlib.import_module("gz_onboard.can.channel")
 
     def create() -> socket.socket:
         return StandIn(socket.AF_INET, socket.SOCK_DGRAM)

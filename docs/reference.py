@@ -8,20 +8,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from gz_onboard.calibrate import report
+from gz_onboard.calibrate.command import plain_options
+from gz_onboard.calibrate.procedures import PROCEDURES
+from gz_onboard.discover.result import VERSION as DISCOVER_VERSION
+from gz_onboard.discover.result import Report
 from gz_onboard.lab import estimate, validate
-from gz_onboard.lab.calibrate import report
-from gz_onboard.lab.calibrate.command import plain_options
-from gz_onboard.lab.calibrate.procedures import PROCEDURES
-from gz_onboard.lab.discover.result import VERSION as DISCOVER_VERSION
-from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.history.add import AddedRides
 from gz_onboard.lab.history.ride import MEANING
 from gz_onboard.lab.history.show import Shown
 from gz_onboard.lab.history.text import HISTORY_VERSION
 from gz_onboard.lab.history.totals import LearnedAt, Totals
-from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation import summary as simulated
+from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked
 
 PAGE = Path(__file__).with_name("commands.md")
 MARK = "<!-- made by docs/reference.py from here on -->"

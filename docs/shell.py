@@ -14,12 +14,12 @@ from pathlib import Path
 import shtab
 
 from gz_onboard import __version__
+from gz_onboard.calibrate.procedures import PROCEDURES
 from gz_onboard.cli import COMMANDS, command_line
-from gz_onboard.lab.calibrate.procedures import PROCEDURES
-from gz_onboard.lab.vehicle.cells import CHEMISTRIES
-from gz_onboard.lab.vehicle.kinds import KINDS
 from gz_onboard.simulation import cycles
 from gz_onboard.vehicle import OWN
+from gz_onboard.vehicle_check.cells import CHEMISTRIES
+from gz_onboard.vehicle_check.kinds import KINDS
 
 ABOUT = "the remaining range of an electric scooter, estimated from its CAN bus"
 

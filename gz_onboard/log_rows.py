@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
-from gz_onboard.bus.logfile import object_schema
+from gz_onboard.can.logfile import object_schema
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
@@ -92,7 +92,7 @@ TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
 
 
 class Log(Protocol):
-    """A log that the pipeline writes to; implemented by `gz_onboard.bus.logfile` and `recorder`."""
+    """A log that the pipeline writes to; implemented by `gz_onboard.can.logfile` and `recorder`."""
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 
-from gz_onboard.bus.codec import DROPPING, RANGE, Codec
-from gz_onboard.bus.origins import Origins
-from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
+from gz_onboard.can.codec import DROPPING, RANGE, Codec
+from gz_onboard.can.origins import Origins
+from gz_onboard.can.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.estimator import signals
@@ -37,8 +37,8 @@ from gz_onboard.log_rows import (
     reason_names,
     ride_row,
 )
+from gz_onboard.model.drawable import drawable
 from gz_onboard.options import FILTERS
-from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz

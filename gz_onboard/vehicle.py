@@ -7,17 +7,17 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gz_onboard.bus.dbc import find_dbc
-from gz_onboard.bus.mapping import BusMapping, read_mapping
-from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, RANGE_DBC, Publisher
+from gz_onboard.can.dbc import find_dbc
+from gz_onboard.can.mapping import BusMapping, read_mapping
+from gz_onboard.can.publisher import GROUP_STEP, MESSAGES, RANGE_DBC, Publisher
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import MOST_EXTENDED, MOST_STANDARD
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import Effect, read_effects
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.parameters import Parameters, read_parameters
-from gz_onboard.physics.riding import PriorRiding, read_riding
-from gz_onboard.physics.tables import Derating, read_battery, read_derating
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.effect import Effect, read_effects
+from gz_onboard.model.model import Model
+from gz_onboard.model.parameters import Parameters, read_parameters
+from gz_onboard.model.riding import PriorRiding, read_riding
+from gz_onboard.model.tables import Derating, read_battery, read_derating
 from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple, TextIO, cast
 from cantools.database.can import Message
 
 from gz_onboard import cli, state
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.dashboard.view import View
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.display.view import View
 from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
 from gz_onboard.log_rows import ESTIMATE_TOPIC

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.can.codec import Codec
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.plausibility.residual import Sensor
 from gz_onboard.estimator.signals import Signals

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.requests import Request
+from gz_onboard.can.requests import Request
 from gz_onboard.events import Frame
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import EPOCH, MS, S

@@ -9,9 +9,9 @@ from pathlib import Path
 import can
 import pytest
 
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.layout import identifiers_of
-from gz_onboard.bus.recorder import Recorder
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.layout import identifiers_of
+from gz_onboard.can.recorder import Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.recording.logs import read_frames

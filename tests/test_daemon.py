@@ -29,9 +29,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
-from gz_onboard.bus._can import LibraryBus
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.recorder import LogLimits, Recorder, is_complete
+from gz_onboard.can._can import LibraryBus
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock, summary
 from gz_onboard.daemon.loop import Daemon, fair_share

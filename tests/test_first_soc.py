@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gz_onboard.calibrate.cooling_run import ride_run
+from gz_onboard.discover.mixed_model import initial
+from gz_onboard.discover.residuals import start_soc
 from gz_onboard.events import Group
-from gz_onboard.lab.calibrate.cooling_run import ride_run
-from gz_onboard.lab.discover.mixed_model import initial
-from gz_onboard.lab.discover.residuals import start_soc
+from gz_onboard.model.effect import Port
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.series import all_quantities, first_soc, total
-from gz_onboard.physics.effect import Port
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator

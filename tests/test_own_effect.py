@@ -15,8 +15,8 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import Bound
+from gz_onboard.model.effect import load_effect
+from gz_onboard.model.model import Bound
 from gz_onboard.vehicle import OWN, read_vehicle
 
 ROOT = Path(__file__).parents[1]

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.events import Group
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.drawable import drawable
+from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.offline.series import ocv_over
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.drawable import drawable
-from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.physics.effect import BASE_EFFECTS, QUANTITIES
+from gz_onboard.model.effect import BASE_EFFECTS, QUANTITIES
 
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
@@ -19,7 +19,7 @@ LAYERS = [
     ["arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
     ["imports", "options"],
     ["toml", "routes"],
-    ["bus", "physics"],
+    ["can", "model"],
     ["vehicle"],
     ["estimator"],
     ["log_rows"],
@@ -27,8 +27,10 @@ LAYERS = [
     ["recording"],
     ["offline"],
     ["simulation"],
-    ["lab", "dashboard"],
-    ["bridges"],
+    ["lab", "display"],
+    ["calibrate"],
+    ["discover"],
+    ["vehicle_check"],
     ["daemon"],
     ["api"],
     ["cli", "__init__"],  # the latter has the names of the API, imported when first asked for
@@ -36,44 +38,16 @@ LAYERS = [
 ]
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 
+OFFLINE = ("recording", "offline", "simulation", "lab", "calibrate", "discover", "vehicle_check", "api")
 # Lower, and yet nothing that these need know.
 FORBIDDEN = {
-    ("estimator", "bus"): "events are all that the estimator sees of a bus",
-    ("daemon", "lab"): "the daemon carries no offline tools",
-    ("daemon", "simulation"): "the daemon carries no offline tools",
-    ("daemon", "offline"): "the daemon carries no offline tools",
-    ("daemon", "recording"): "the daemon carries no offline tools",
+    ("estimator", "can"): "events are all that the estimator sees of a bus",
+    **{("daemon", part): "the daemon carries no offline tools" for part in OFFLINE},
 }
 
-OFFLINE = ("recording", "offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
 # Imported only on request, or for types: the reference filter behind --filter filterpy, arrays, the MQTT client.
-ON_REQUEST = {"estimator/filterpy_reference.py", "arrays.py", "bridges/broker.py"}
-
-# The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
-# that stand before it.
-STAGES = {
-    "plain data": ["result", "wording"],
-    "read": ["stand_ins", "grid"],
-    "residuals": ["system", "residuals", "pack_power", "channels", "blocks"],
-    "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
-    "search": ["search", "curve_forms", "curves", "selection"],
-    "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "strain", "verdict"],
-    "report": [
-        "gain",
-        "baseline_check",
-        "baseline",
-        "detectability",
-        "discovery",
-        "breakdown",
-        "summary",
-        "plots",
-        "page",
-        "extension",
-    ],
-    "command": ["command"],
-}
-STAGE = {module: place for place, module in enumerate(module for modules in STAGES.values() for module in modules)}
+ON_REQUEST = {"estimator/filterpy_reference.py", "arrays.py", "display/broker.py"}
 
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 
@@ -109,7 +83,7 @@ def at_import_time(body: list[ast.stmt]) -> Iterator[ast.AST]:
 
 
 def test_there_is_something_to_check():
-    assert {"bus", "physics", "estimator", "daemon", "cli"} <= {part_of(m) for m in MODULES}
+    assert {"can", "model", "estimator", "daemon", "cli"} <= {part_of(m) for m in MODULES}
 
 
 @pytest.mark.parametrize("module", MODULES, ids=str)
@@ -197,20 +171,11 @@ def test_a_circle_is_seen():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}) == [["b", "c"]]
 
 
-def test_imports_of_the_discovery_go_down_its_stages():
-    inside = "gz_onboard.lab.discover."
-    of = {name.removeprefix(inside): found for name, found in graph().items() if name.startswith(inside)}
-    assert set(of) == set(STAGE)
-    for module, found in of.items():
-        for other in (name.removeprefix(inside) for name in found if name.startswith(inside)):
-            assert STAGE[other] < STAGE[module], f"{module} imports {other}, which does not stand before it"
-
-
 def test_effects_are_known_by_what_they_declare():
     """No name of an effect outside its file, but for the list of those that a vehicle file gets that lists none."""
-    effects = {path.stem for path in (PACKAGE / "physics/effects").glob("*.py")} - set(QUANTITIES)
-    listed = {PACKAGE / "physics/effect.py": set(BASE_EFFECTS)}
-    for module in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "physics/effects").glob("*.py")):
+    effects = {path.stem for path in (PACKAGE / "model/effects").glob("*.py")} - set(QUANTITIES)
+    listed = {PACKAGE / "model/effect.py": set(BASE_EFFECTS)}
+    for module in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "model/effects").glob("*.py")):
         nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
         named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects
         assert not named - listed.get(module, set()), f"{module.relative_to(PACKAGE)} names {named}"
@@ -236,7 +201,7 @@ def later():
     import matplotlib
 """
     tree = ast.parse(source)
-    found = set(imports(ast.walk(tree), Path("bus/codec.py")))
+    found = set(imports(ast.walk(tree), Path("can/codec.py")))
     assert {"gz_onboard.lab", "gz_onboard.daemon", "gz_onboard.estimator.signals", "matplotlib", "pandas"} <= found
-    assert HEAVY & set(imports(at_import_time(tree.body), Path("bus/codec.py"))) == {"scipy"}
-    assert "numpy.linalg" in set(imports(at_import_time(tree.body), Path("bus/codec.py")))
+    assert HEAVY & set(imports(at_import_time(tree.body), Path("can/codec.py"))) == {"scipy"}
+    assert "numpy.linalg" in set(imports(at_import_time(tree.body), Path("can/codec.py")))

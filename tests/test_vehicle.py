@@ -10,8 +10,8 @@ import pytest
 
 import gz_onboard
 from gz_onboard.errors import InputError
+from gz_onboard.model.effect import load_effect
 from gz_onboard.offline.correlations import correlations
-from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import OWN, find_vehicle, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
@@ -117,7 +117,7 @@ def test_a_name_is_never_a_file_that_happens_to_be_there(tmp_path, monkeypatch):
 # --- effects that come with a file are code -----------------------------------------------------------------------
 
 EFFECT = """
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.model.effect import Parameter, Port
 open(__file__ + ".ran", "w").close()
 PORT = Port.DC_POWER
 PARAMETERS = (Parameter("horn_power", "W", 5.0, 1.0, 0.0, 50.0, "a guess"),)

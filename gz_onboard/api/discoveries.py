@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import TypeAlias
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, read_ride, read_vehicle, vehicle_of
+from gz_onboard.calibrate.vehicle_file import vehicle_output
+from gz_onboard.discover import command as discovery
+from gz_onboard.discover.baseline import baseline as learn_baseline
+from gz_onboard.discover.baseline_file import write_baseline
+from gz_onboard.discover.command import DiscoveryOptions
+from gz_onboard.discover.mixed_model import MixedModel
+from gz_onboard.discover.page import write_report
+from gz_onboard.discover.result import Report
+from gz_onboard.discover.summary import summary
+from gz_onboard.discover.verdict import Discovery
 from gz_onboard.errors import brief, not_an_input, writing
-from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
-from gz_onboard.lab.discover import command as discovery
-from gz_onboard.lab.discover.baseline import baseline as learn_baseline
-from gz_onboard.lab.discover.baseline_file import write_baseline
-from gz_onboard.lab.discover.command import DiscoveryOptions
-from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.page import write_report
-from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.discover.summary import summary
-from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.table import Columns, Tabular, columns_of

@@ -12,15 +12,15 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.layout import identifiers_of
-from gz_onboard.bus.recorder import LogLimits, Recorder
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.layout import identifiers_of
+from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.daemon.control import SOCKET
 from gz_onboard.daemon.loop import Daemon, foreign_text, status_text
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
 from gz_onboard.estimator.consumption import CONSUMPTION
+from gz_onboard.model.effect import ROOT
 from gz_onboard.options import CHANNEL, add_shared, number
-from gz_onboard.physics.effect import ROOT
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.routes.route import read_route
 from gz_onboard.state import state_file

@@ -19,8 +19,8 @@ from typing import Any
 
 from gz_onboard import state
 from gz_onboard.background import Background
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.recorder import BackgroundRecorder, Recorder
 from gz_onboard.daemon.control import Control
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.log_rows import reason_names

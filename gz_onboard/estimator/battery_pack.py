@@ -37,9 +37,9 @@ from gz_onboard.estimator.saved_state import Each, Number
 from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.estimator.weakest import WeakestGroup
 from gz_onboard.events import WINDOW
-from gz_onboard.physics.battery import HALF_FULL, Battery, Health
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.model import STOOD, Model, standing_load
+from gz_onboard.model.battery import HALF_FULL, Battery, Health
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.model import STOOD, Model, standing_load
 
 
 @dataclass(frozen=True)

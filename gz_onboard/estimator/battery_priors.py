@@ -19,8 +19,8 @@ from typing import NamedTuple
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.battery_filter import FilterState, condition, with_soc
 from gz_onboard.estimator.plausibility.electrical import CurrentSource
-from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.parameters import Parameters
+from gz_onboard.model.battery import HALF_FULL, Battery
+from gz_onboard.model.parameters import Parameters
 
 
 @dataclass(frozen=True)

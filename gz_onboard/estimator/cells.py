@@ -9,11 +9,11 @@ from typing import NamedTuple
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import WINDOW
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.drawable import pack_constants
-from gz_onboard.physics.effect import QUANTITIES, Port
-from gz_onboard.physics.model import Model, share_that_ages
-from gz_onboard.physics.parameters import Parameters
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.drawable import pack_constants
+from gz_onboard.model.effect import QUANTITIES, Port
+from gz_onboard.model.model import Model, share_that_ages
+from gz_onboard.model.parameters import Parameters
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length

@@ -26,11 +26,11 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
 from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.saved_state import FINITE, Each, Number, Text
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.effects.inertia import rotating_mass
+from gz_onboard.model.model import Model
+from gz_onboard.model.riding import PriorRiding
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,10 @@ from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.saved_state import VERSION, Each, Number, Text, check, check_vehicle
 from gz_onboard.estimator.signals import TIMING, Signals
 from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.model import Model
+from gz_onboard.model.riding import PriorRiding
 
 SILENT_AFTER = 2.0  # s without a step: what was measured is no longer reported
 STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be expected soon

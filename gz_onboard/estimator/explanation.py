@@ -31,9 +31,9 @@ from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import USUAL_AIR, Conditions, LoadModel
 from gz_onboard.events import Cause, Explanation
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.drawable import cells_ahead, drawable
-from gz_onboard.physics.model import Model
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.drawable import cells_ahead, drawable
+from gz_onboard.model.model import Model
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.plausibility.electrical import PackReading
 from gz_onboard.estimator.saved_state import Each, Number
 from gz_onboard.events import Activity, Estimate, Reason
-from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.drawable import Drawable, cells_ahead, drawable, pack_constants
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.battery import HALF_FULL, Battery
+from gz_onboard.model.drawable import Drawable, cells_ahead, drawable, pack_constants
+from gz_onboard.model.model import Model
+from gz_onboard.model.riding import PriorRiding
 
 
 @dataclass(frozen=True)

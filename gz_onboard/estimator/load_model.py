@@ -18,10 +18,10 @@ from math import pi
 from typing import TYPE_CHECKING, NamedTuple
 
 from gz_onboard.constants import MILD
-from gz_onboard.physics.battery import HALF_FULL, Battery, Overpotential
-from gz_onboard.physics.effect import MOVING, Port
-from gz_onboard.physics.model import Model, Recall, air_density, stepping
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.battery import HALF_FULL, Battery, Overpotential
+from gz_onboard.model.effect import MOVING, Port
+from gz_onboard.model.model import Model, Recall, air_density, stepping
+from gz_onboard.model.riding import PriorRiding
 
 if TYPE_CHECKING:
     from gz_onboard.estimator.battery_pack import BatteryPack

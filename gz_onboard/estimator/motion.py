@@ -14,8 +14,8 @@ from math import asin, atan, atan2, cos, exp, inf, pi, sin, sqrt
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.signals import FIX_3D, Signal, Signals
 from gz_onboard.events import WINDOW, Activity
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, grade_shown, speed_factors
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, grade_shown, speed_factors
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from gz_onboard.estimator.battery_priors import PRIOR, bounded
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.physics.battery import MOST_SOC_SD, QUICK, Battery, Health
+from gz_onboard.model.battery import MOST_SOC_SD, QUICK, Battery, Health
 
 
 @dataclass(frozen=True)

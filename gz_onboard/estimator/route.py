@@ -28,10 +28,10 @@ from gz_onboard.estimator.load_model import Conditions, LoadModel
 from gz_onboard.estimator.motion import Motion
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import Estimate, RouteState
-from gz_onboard.physics.drawable import soc_left
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.functions import sqrt as root
+from gz_onboard.model.drawable import soc_left
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.effects.inertia import rotating_mass
+from gz_onboard.model.functions import sqrt as root
 from gz_onboard.routes.route import Route, speed_profile
 
 if TYPE_CHECKING:

@@ -28,8 +28,8 @@ from gz_onboard.estimator.pack_age import SAME, LearnedFactor
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import FINITE, Each, Number
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.physics.battery import Battery, WeakGroup
-from gz_onboard.physics.parameters import Parameters
+from gz_onboard.model.battery import Battery, WeakGroup
+from gz_onboard.model.parameters import Parameters
 
 NAMES = "weak_charge", "weak_capacity", "weak_resistance"
 

@@ -9,8 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 
 from gz_onboard import __version__, state
-from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.recorder import is_complete
+from gz_onboard.can.logfile import LogFile
+from gz_onboard.can.recorder import is_complete
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through, vehicle_of
 from gz_onboard.lab.estimate_state import StateAt, latest, text_of

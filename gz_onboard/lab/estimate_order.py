@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
-from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
+from gz_onboard.can.codec import LONGEST_PAUSE_NS, Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.lab.estimate_log import EstimateTask

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
-from gz_onboard.bus.publisher import Publisher
+from gz_onboard.can.codec import LONGEST_PAUSE_NS, Codec
+from gz_onboard.can.publisher import Publisher
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate

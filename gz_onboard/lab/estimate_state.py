@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from gz_onboard import state
-from gz_onboard.bus.codec import BACK_NS
+from gz_onboard.can.codec import BACK_NS
 from gz_onboard.errors import InputError, writing
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.pipeline import Pipeline

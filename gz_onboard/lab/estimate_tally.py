@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from math import sqrt
 
-from gz_onboard.bus.publisher import KNOWN
+from gz_onboard.can.publisher import KNOWN
 from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import reason_names
 

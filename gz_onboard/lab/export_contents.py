@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.bus.codec import BACK_NS
+from gz_onboard.can.codec import BACK_NS
 from gz_onboard.lab.export_tables import recorded_messages
 from gz_onboard.offline.results import clock, text_rows
 from gz_onboard.recording import logs

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.can.mapping import BusMapping
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC
 from gz_onboard.offline import write_tables
@@ -216,7 +216,7 @@ def decoder_of(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> 
 
 
 def _mapping(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> BusMapping:
-    from gz_onboard.bus.dbc import database_of, load_database
+    from gz_onboard.can.dbc import database_of, load_database
 
     if files:
         return BusMapping(load_database(files, {}), tuple(files), (), {}, {})
@@ -238,7 +238,7 @@ def _mapping(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> Bu
 
 def _mapping_of(vehicle: Vehicle) -> BusMapping:
     """The vehicle's bus with its own range frames."""
-    from gz_onboard.bus.dbc import load_database
+    from gz_onboard.can.dbc import load_database
 
     if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: without it no frame can be decoded")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gz_onboard.errors import InputError
-from gz_onboard.physics.parameters import Value
+from gz_onboard.model.parameters import Value
 
 ENTERED = "as entered"
 """The status of what is told with the rides, which counts before the file's."""

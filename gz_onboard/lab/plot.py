@@ -13,7 +13,7 @@ from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.codec import DROPPING
+from gz_onboard.can.codec import DROPPING
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import BAD_INPUT, OK, InputError, writing
 from gz_onboard.events import Activity, Reason, State, words

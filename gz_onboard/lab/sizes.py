@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import log
 
-from gz_onboard.physics.parameters import USUAL_CELLS, declared_parameters
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.parameters import USUAL_CELLS, declared_parameters
+from gz_onboard.model.riding import PriorRiding
 from gz_onboard.vehicle import Vehicle
 
 

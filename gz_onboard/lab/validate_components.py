@@ -19,6 +19,9 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
+from gz_onboard.model.battery import discharged
+from gz_onboard.model.effect import MOVING, ROAD_LOAD, Port
+from gz_onboard.model.model import air_density, drag_torque
 from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.offline.sensors import road_speed
 from gz_onboard.offline.series import (
@@ -32,9 +35,6 @@ from gz_onboard.offline.series import (
     terminal_voltage,
     total,
 )
-from gz_onboard.physics.battery import discharged
-from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
-from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
 

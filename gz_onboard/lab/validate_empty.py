@@ -8,8 +8,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_score import NAMES, PackEmpty
+from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.offline.series import curve_over
-from gz_onboard.physics.functions import PiecewiseLinear
 from gz_onboard.simulation.run import Run, ran_empty
 from gz_onboard.vehicle import Vehicle
 

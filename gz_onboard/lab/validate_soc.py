@@ -16,7 +16,7 @@ from typing import Annotated
 from gz_onboard.arrays import Array
 from gz_onboard.constants import MILD
 from gz_onboard.estimator.battery_priors import VoltageNoise
-from gz_onboard.physics.battery import discharged
+from gz_onboard.model.battery import discharged
 from gz_onboard.vehicle import Vehicle
 
 LAST = 120  # s of a ride, whose voltage is asked

@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.codec import LENGTH
-from gz_onboard.bus.layout import MessageSignals, Values
-from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.bus.origins import Origins
-from gz_onboard.bus.requests import NEGATIVE, answer_readers
+from gz_onboard.can.codec import LENGTH
+from gz_onboard.can.layout import MessageSignals, Values
+from gz_onboard.can.mapping import BusMapping
+from gz_onboard.can.origins import Origins
+from gz_onboard.can.requests import NEGATIVE, answer_readers
 from gz_onboard.events import Frame
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
-from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.can.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
+from gz_onboard.can.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, hexadecimal
 from gz_onboard.offline.arguments import check, within

@@ -8,7 +8,7 @@ from typing import Any
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.physics.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, speed_factors, true_current, true_voltage
+from gz_onboard.model.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, speed_factors, true_current, true_voltage
 
 Columns = Mapping[str, tuple[Array, Array]]
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gz_onboard.arrays import Array
-from gz_onboard.physics.battery import HALF_FULL, Battery, discharged, reversible_heat
-from gz_onboard.physics.effect import QUANTITIES, Equation, Port
-from gz_onboard.physics.functions import Mesh, PiecewiseLinear, exp, sqrt
-from gz_onboard.physics.model import STOOD, Bound, Model, Recall
+from gz_onboard.model.battery import HALF_FULL, Battery, discharged, reversible_heat
+from gz_onboard.model.effect import QUANTITIES, Equation, Port
+from gz_onboard.model.functions import Mesh, PiecewiseLinear, exp, sqrt
+from gz_onboard.model.model import STOOD, Bound, Model, Recall
 
 NEGLIGIBLE = 1e-20  # share of a value that is too small to change it in floating point
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources, known_units, to_si
+from gz_onboard.can.mapping import BusMapping, Source, TimeColumn, column_sources, known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
@@ -279,7 +279,7 @@ def _database(columns: Sequence[_Column]) -> Database:
     from cantools.database.can import Message, Signal
     from cantools.database.conversion import BaseConversion
 
-    from gz_onboard.bus.dbc import empty_database  # before cantools
+    from gz_onboard.can.dbc import empty_database  # before cantools
 
     database = empty_database()
     for column in columns:

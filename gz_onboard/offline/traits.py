@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from types import ModuleType
 
-from gz_onboard.physics.effect import Effect, Equation
+from gz_onboard.model.effect import Effect, Equation
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.logfile import LogFile, object_schema
+from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
 from gz_onboard.offline.decode_signals import Decoder
@@ -66,7 +66,7 @@ def whole(out: Path, suffix: str) -> Iterator[Path]:
 
 def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
     """Write the frames to `out` by python-can, in the format of `suffix`; returns their number."""
-    from gz_onboard.bus._can import can
+    from gz_onboard.can._can import can
     from gz_onboard.recording.readers.python_can import message_of, with_asammdf
 
     if suffix == ".mf4":

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.bus.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
-from gz_onboard.bus.layout import crc_differences, first_bit, is_not_available
-from gz_onboard.bus.mapping import Source
+from gz_onboard.can.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
+from gz_onboard.can.layout import crc_differences, first_bit, is_not_available
+from gz_onboard.can.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, WINDOW_NS, Pipeline
 from gz_onboard.progress import Progress

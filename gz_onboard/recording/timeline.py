@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.bus.codec import AHEAD_NS, BACK_NS, CONFIRM, Codec
+from gz_onboard.can.codec import AHEAD_NS, BACK_NS, CONFIRM, Codec
 
 _GAP_NS = 500_000_000  # ahead by less is no gap
 _DENSE = 20  # frames without a gap: a bus that sends as many does not end in a gap and one frame or two

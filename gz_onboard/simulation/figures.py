@@ -9,6 +9,7 @@ import numpy as np
 
 from gz_onboard.constants import WH
 from gz_onboard.events import words
+from gz_onboard.model.effect import Effect, Port
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -26,7 +27,6 @@ from gz_onboard.offline.style import (
     stack,
     time_unit,
 )
-from gz_onboard.physics.effect import Effect, Port
 from gz_onboard.simulation.run import Run
 from gz_onboard.simulation.summary import Variant
 

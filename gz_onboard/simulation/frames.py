@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gz_onboard.bus.layout import raw_range, sae_j1850_tables
+from gz_onboard.can.layout import raw_range, sae_j1850_tables
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.offline.write_logs import out_suffix, write_frames_as

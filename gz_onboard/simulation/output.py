@@ -128,7 +128,7 @@ def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
             writer.writerow(names)
             writer.writerows(["" if math.isnan(value) else f"{value:.9g}" for value in row] for row in rows)
         return
-    from gz_onboard.bus.logfile import LogFile
+    from gz_onboard.can.logfile import LogFile
 
     log = LogFile(file.open("wb"), 0, metadata)
     try:

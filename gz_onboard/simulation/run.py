@@ -14,8 +14,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import brief
+from gz_onboard.model.drawable import drawable
 from gz_onboard.offline.arrays import stretches
-from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.beyond import LOADED, Beyond, beyond_pack
 from gz_onboard.simulation.parts.rider import Rider

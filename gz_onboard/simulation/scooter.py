@@ -15,12 +15,12 @@ from math import sqrt
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
+from gz_onboard.model.effect import MOVING, QUANTITIES, Port
+from gz_onboard.model.functions import direction
+from gz_onboard.model.model import air_density, drag_torque
 from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.offline.series import stepper
 from gz_onboard.offline.traits import traits
-from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.functions import direction
-from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.battery import FirstOrderPack, PackModel
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis

@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.sensors import VIBRATION_PERIOD_S
+from gz_onboard.model.sensors import VIBRATION_PERIOD_S
 from gz_onboard.simulation.trace import Truth
 
 BAR = 1e5  # Pa

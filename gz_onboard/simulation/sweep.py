@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.model.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
 CELLS = ("battery.cells_parallel", "battery.cells_series")

@@ -13,8 +13,8 @@ import threading
 from pathlib import Path
 
 from gz_onboard import cli
-from gz_onboard.bus._can import can
-from gz_onboard.bus.publisher import Publisher
+from gz_onboard.can._can import can
+from gz_onboard.can.publisher import Publisher
 from tests.support import LOGS
 
 BUS = ["--interface", "virtual", "--channel", "ride"]

@@ -10,9 +10,9 @@ import pytest
 from gz_onboard.events import NO_SENSOR, ROLES, Estimate, Reason, State
 from tests.browser.support import plain, shows, texts, wait_for
 from tests.browser.test_page import UNREACHABLE
-from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
-from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
-from tests.dashboard.test_terminal import ESTIMATE
+from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
+from tests.display.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.display.test_terminal import ESTIMATE
 
 SIZES = [(320, 240), (480, 320), (390, 844), (800, 480), (1280, 800)]
 

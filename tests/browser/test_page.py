@@ -8,12 +8,12 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from gz_onboard.dashboard.server import Feed, served
+from gz_onboard.display.server import Feed, served
 from gz_onboard.events import Estimate, Reason, State
 from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
-from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
-from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
-from tests.dashboard.test_terminal import ESTIMATE
+from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
+from tests.display.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.display.test_terminal import ESTIMATE
 
 UNREACHABLE = replace(
     ON_ROUTE,
@@ -184,7 +184,7 @@ def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
             page.goto(address)
             shows(page, range_value="34")
             page.evaluate("window.same = true")
-        monkeypatch.setattr("gz_onboard.dashboard.server.__version__", "another")
+        monkeypatch.setattr("gz_onboard.display.server.__version__", "another")
         with ExitStack() as stack:
             with page.expect_event("load"):
                 stack.enter_context(dashboard("new", urlsplit(address).netloc))

@@ -7,8 +7,8 @@ import pytest
 
 from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
+from gz_onboard.model.battery import Health
 from gz_onboard.offline.series import advanced
-from gz_onboard.physics.battery import Health
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 from tests.support import cell_voltage

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gz_onboard.estimator.consumption import Habits, LearnedQuantity
 from gz_onboard.estimator.forecast import Forecaster, RangeSmoother
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.model.riding import PriorRiding
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)

@@ -14,8 +14,8 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.events import Cause, Explanation
 from gz_onboard.log_rows import explanation_row
-from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import Model
+from gz_onboard.model.effect import load_effect
+from gz_onboard.model.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 VEHICLE = read_vehicle("reference")

@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, Ledger
-from gz_onboard.physics.effect import load_effect
+from gz_onboard.model.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
 from tests.events import EventEstimator
@@ -291,8 +291,8 @@ def test_memory_between_road_and_pack_steps_each_second(tmp_path):
     """A drag that comes up over a minute, as of a user's own file."""
     (tmp_path / "slow_drag.py").write_text(
         '"""A drag that comes up slowly."""\n'
-        "from gz_onboard.physics.effect import Parameter, Port\n"
-        "from gz_onboard.physics.functions import exp\n"
+        "from gz_onboard.model.effect import Parameter, Port\n"
+        "from gz_onboard.model.functions import exp\n"
         "PORT = Port.WHEEL_FORCE\n"
         'PARAMETERS = (Parameter("slow_drag", "N", 20.0, 5.0, 0.0, 50.0, "made up for a test"),)\n'
         "def term(speed, *, slow_drag):\n"

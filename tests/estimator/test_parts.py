@@ -11,8 +11,8 @@ from gz_onboard.estimator.battery_priors import PRIOR, ChargeNoise, VoltageNoise
 from gz_onboard.estimator.plausibility.electrical import CurrentSource
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import ROLES, WINDOW, Group, Reason
-from gz_onboard.physics.functions import PiecewiseLinear
-from gz_onboard.physics.parameters import Parameters
+from gz_onboard.model.functions import PiecewiseLinear
+from gz_onboard.model.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator, ShownSignals
 

@@ -16,7 +16,7 @@ from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
 from gz_onboard.estimator.route import HeightCheck, PreparedRoute, RouteForecaster
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
-from gz_onboard.physics.drawable import Drawable, drawable, soc_left
+from gz_onboard.model.drawable import Drawable, drawable, soc_left
 from gz_onboard.routes.route import Route
 from tests.events import ShownSignals
 from tests.support import reference

@@ -10,8 +10,8 @@ import pytest
 from gz_onboard.estimator.battery_pack import PACK
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.events import Group
-from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import Model
+from gz_onboard.model.effect import Port
+from gz_onboard.model.model import Model
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 

@@ -17,8 +17,8 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW, Group, RoleWindow
+from gz_onboard.model.effect import load_effect
 from gz_onboard.offline.sensors import Vibration
-from gz_onboard.physics.effect import load_effect
 from gz_onboard.simulation.frames import batches, simulate_frames
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter
@@ -30,7 +30,7 @@ from tests.support import joined, ridden, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
 ROUGH = """\"\"\"Drag of a rough road, in proportion to the vibration, made up for a test.\"\"\"
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.model.effect import Parameter, Port
 PORT = Port.{port}
 PARAMETERS = (Parameter("rough_road", "1", {value}, 1.0, 0.0, 50.0, "made up for a test"),)
 def term(vibration, *, rough_road):

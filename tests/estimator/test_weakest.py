@@ -13,13 +13,13 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.can.codec import Codec
 from gz_onboard.estimator import forecast
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.weakest import CHARGE, CONFIG, NAMES, VoltageBlock, WeakestGroup
 from gz_onboard.events import Cause, Group
-from gz_onboard.physics.battery import Battery, Health, WeakGroup
-from gz_onboard.physics.drawable import drawable
+from gz_onboard.model.battery import Battery, Health, WeakGroup
+from gz_onboard.model.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, EventEstimator, ShownSignals, events_of
 from tests.plant.machine import SERIES

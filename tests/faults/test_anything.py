@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.codec import DROPPING
+from gz_onboard.can.codec import DROPPING
 from gz_onboard.events import Frame
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.faults.support import check_all, shortened, spoilt

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from gz_onboard.bus.codec import COUNTER, CRC, LENGTH
+from gz_onboard.can.codec import COUNTER, CRC, LENGTH
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame, Reason, State
 from tests.faults.support import BEGIN, END, PASSING, RIDE, Spoil, check_all, of, ride, shortened, spoilt, unspoilt
 from tests.support import S, changed, check_frames, identifier, reasons_in, ridden

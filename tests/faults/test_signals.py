@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.codec import NOT_AVAILABLE, RANGE
+from gz_onboard.can.codec import NOT_AVAILABLE, RANGE
 from gz_onboard.events import Reason
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.faults.support import BEGIN, END, absent, check_all, of, ride, spoilt

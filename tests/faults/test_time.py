@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from gz_onboard.bus.codec import TIME
+from gz_onboard.can.codec import TIME
 from gz_onboard.events import Frame, Reason, State
 from gz_onboard.pipeline import TICK_NS
 from tests.faults.support import (

@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from gz_onboard.calibrate.manifest import read_manifest
+from gz_onboard.calibrate.procedures import PROCEDURES
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.lab.calibrate.manifest import read_manifest
-from gz_onboard.lab.calibrate.procedures import PROCEDURES
-from gz_onboard.physics.battery import Battery
+from gz_onboard.model.battery import Battery
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.hardening.report import Report

@@ -23,8 +23,8 @@ from unittest import mock
 
 from mcap.writer import MCAP0_MAGIC
 
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.recorder import LogLimits, Recorder
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS

@@ -13,7 +13,7 @@ from random import Random
 from typing import Any
 
 from gz_onboard import state
-from gz_onboard.bus.codec import Codec
+from gz_onboard.can.codec import Codec
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import Group
 from tests.events import Event, EventEstimator, events_of

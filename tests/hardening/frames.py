@@ -17,8 +17,8 @@ from math import isfinite
 from operator import itemgetter
 from random import Random
 
-from gz_onboard.bus.codec import DROPPING, TIME, Codec
-from gz_onboard.bus.layout import raw_range
+from gz_onboard.can.codec import DROPPING, TIME, Codec
+from gz_onboard.can.layout import raw_range
 from gz_onboard.daemon.loop import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.pipeline import TICK_NS

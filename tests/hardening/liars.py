@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.can.codec import Codec
 from gz_onboard.events import Estimate, State
 from gz_onboard.recording.logs import read_frames
 from tests.events import Event, EventEstimator, events_of

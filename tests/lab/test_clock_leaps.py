@@ -11,11 +11,11 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.errors import InputError
-from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
-from tests.bus.doctor import complaints
+from gz_onboard.vehicle_check.check import check_log, check_text
+from tests.can.doctor import complaints
 from tests.support import LOGS, write_log
 
 DAY = 86_400 * 10**9

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import cli
-from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.events import EFF_FLAG, WINDOW, Estimate
 from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_log import EstimateTask

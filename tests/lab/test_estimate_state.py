@@ -19,8 +19,8 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import state
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.recorder import is_complete
+from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.recorder import is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon import loop
 from gz_onboard.daemon.loop import Daemon

@@ -15,8 +15,8 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard import cli
-from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logfile import LogFile, object_schema
+from gz_onboard.can.codec import Codec
+from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export as command

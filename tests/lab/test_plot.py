@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard import cli
-from gz_onboard.bus.logfile import LogFile
+from gz_onboard.can.logfile import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import Cause, Explanation, words
 from gz_onboard.lab import logged, plot

@@ -24,11 +24,11 @@ from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, split
 from gz_onboard.lab.validate_soc import soc_reference
+from gz_onboard.model.model import Model
+from gz_onboard.model.parameters import Parameters
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.parameters import Parameters
 from gz_onboard.simulation.recorded import read_recorded, rest_soc
 from gz_onboard.vehicle import OWN, read_vehicle
 

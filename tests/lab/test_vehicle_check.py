@@ -14,9 +14,11 @@ from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
 from gz_onboard.estimator.plausibility.motion import GROUND
-from gz_onboard.lab.vehicle.charge import check_charge
-from gz_onboard.lab.vehicle.check import check_log, check_text, checks_of
-from gz_onboard.lab.vehicle.electric import (
+from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle_check.charge import check_charge
+from gz_onboard.vehicle_check.check import check_log, check_text, checks_of
+from gz_onboard.vehicle_check.electric import (
     BY_POWER,
     PackRide,
     check_road,
@@ -26,13 +28,11 @@ from gz_onboard.lab.vehicle.electric import (
     model_power,
     unless_contradicted,
 )
-from gz_onboard.lab.vehicle.finding import Finding, Looks
-from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
-from gz_onboard.lab.vehicle.on_board import on_board
-from gz_onboard.lab.vehicle.rolling import rolling_of
-from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of, too_little, unit_of
-from gz_onboard.offline.samples import Samples, read_samples
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle_check.finding import Finding, Looks
+from gz_onboard.vehicle_check.motion import check_distances, speeds_of
+from gz_onboard.vehicle_check.on_board import on_board
+from gz_onboard.vehicle_check.rolling import rolling_of
+from gz_onboard.vehicle_check.seconds import Seconds, seconds_of, too_little, unit_of
 from tests.plant.logs import write_log
 from tests.plant.machine import scooter
 from tests.plant.ride import Hidden, ride

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from gz_onboard.lab.discover.result import (
+from gz_onboard.discover.result import (
     Errors,
     FoundCause,
     Gain,

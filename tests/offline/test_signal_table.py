@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.bus.codec import Codec
+from gz_onboard.can.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples, open_ride, read_samples
 from gz_onboard.recording.logs import read_frames

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.codec import CONFLICT, LONGEST_PAUSE_NS, TIME, Codec
-from gz_onboard.bus.layout import crc8_sae_j1850
-from gz_onboard.bus.mapping import BusMapping, read_mapping
+from gz_onboard.can.codec import CONFLICT, LONGEST_PAUSE_NS, TIME, Codec
+from gz_onboard.can.layout import crc8_sae_j1850
+from gz_onboard.can.mapping import BusMapping, read_mapping
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.decode import decode_columns
 from gz_onboard.recording.frames import FrameColumns

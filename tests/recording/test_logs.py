@@ -17,8 +17,8 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.dbc import find_dbc
-from gz_onboard.bus.logfile import LogFile
+from gz_onboard.can.dbc import find_dbc
+from gz_onboard.can.logfile import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab import export
@@ -446,7 +446,7 @@ def test_an_mcap_of_other_things_is_refused(tmp_path: Path) -> None:
 def test_mf4_is_read_where_asammdf_is_installed_and_else_says_so(tmp_path: Path) -> None:
     code = """
 import sys
-from gz_onboard.bus._can import can
+from gz_onboard.can._can import can
 heavy = [name for name in ("pandas", "asammdf", "numpy") if name in sys.modules]
 assert not heavy, heavy
 from gz_onboard.recording.logs import read_frames

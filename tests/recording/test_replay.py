@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
-from gz_onboard.bus.logfile import LogFile
+from gz_onboard.can.logfile import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording import replay as command

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.codec import CONFIRM
+from gz_onboard.can.codec import CONFIRM
 from gz_onboard.events import Frame
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.timeline import stray

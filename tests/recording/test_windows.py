@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.codec import TIME
-from gz_onboard.bus.mapping import BusMapping, read_mapping
+from gz_onboard.can.codec import TIME
+from gz_onboard.can.mapping import BusMapping, read_mapping
 from gz_onboard.events import TRANSMITTED, Frame, MessageWindow, Reason
 from gz_onboard.log_rows import STATUS_TOPIC
 from gz_onboard.pipeline import TICK_NS

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridges.broker import Listener, broker, free_port, listening
+from tests.display.broker import Listener, broker, free_port, listening
 from tests.service.support import ROOT, UNIT, output, systemctl, wait_for
 
 BRIDGE = "gz-onboard-mqtt.service"

@@ -4,8 +4,8 @@ from collections.abc import MutableMapping
 from dataclasses import dataclass
 from math import exp
 
-from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.functions import Mesh
+from gz_onboard.model.battery import Battery
+from gz_onboard.model.functions import Mesh
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 
 

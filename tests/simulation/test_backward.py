@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.backward import RideConditions, backward
-from gz_onboard.physics.effect import QUANTITIES, load_effect
-from gz_onboard.physics.model import air_density
+from gz_onboard.model.effect import QUANTITIES, load_effect
+from gz_onboard.model.model import air_density
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -88,8 +88,8 @@ def test_a_noisy_speed_does_not_cost_more():
 def test_turning_is_seen_by_effects_that_look_for_it():
     from dataclasses import replace
 
-    from gz_onboard.physics.effect import load_effect
-    from gz_onboard.physics.model import Model
+    from gz_onboard.model.effect import load_effect
+    from gz_onboard.model.model import Model
 
     effects = {e.name: e for e in VEHICLE.model.effects} | {"cornering_drag": load_effect("cornering_drag")}
     vehicle = replace(VEHICLE, model=Model(tuple(effects.values()), VEHICLE.parameters))

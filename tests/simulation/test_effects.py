@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.backward import RideConditions, backward
-from gz_onboard.physics.effect import Port, load_effect, package_effects
+from gz_onboard.model.effect import Port, load_effect, package_effects
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
@@ -136,7 +136,7 @@ def test_slow_relaxation_is_a_second_rc_pair():
 
 
 BEARING = """
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.model.effect import Parameter, Port
 PORT = Port.MOTOR_LOSS
 PARAMETERS = (Parameter("bearing_loss", "W", 40.0, 5.0, 0.0, 200.0, "made up"),)
 def term(motor_speed, *, bearing_loss):

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.model.model import air_density
 from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling
-from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.rider import Rider
@@ -107,7 +107,7 @@ def test_2_11_and_2_12_gearing(throttle, brake):
     geared = VEHICLE.parameters.replaced(gear_ratio=0.5, gear_efficiency=0.9)
     from dataclasses import replace
 
-    from gz_onboard.physics.model import Model
+    from gz_onboard.model.model import Model
 
     vehicle = replace(VEHICLE, parameters=geared, model=Model(VEHICLE.model.effects, geared))
     scooter = Scooter(vehicle, soc=0.7, speed=6.0)

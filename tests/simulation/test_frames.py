@@ -10,7 +10,7 @@ from math import atan, pi, sin
 import numpy as np
 import pytest
 
-from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
+from gz_onboard.can.codec import NOT_AVAILABLE, Codec
 from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError

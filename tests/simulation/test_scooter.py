@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.physics.functions import Mesh
+from gz_onboard.model.functions import Mesh
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.scooter import Scooter

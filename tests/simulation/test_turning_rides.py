@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import Model
-from gz_onboard.physics.parameters import read_parameters
+from gz_onboard.model.effect import load_effect
+from gz_onboard.model.model import Model
+from gz_onboard.model.parameters import read_parameters
 from gz_onboard.simulation.parts.chassis import HARDEST, MODELS, chassis, steady_turn
 from gz_onboard.simulation.run import drive, follow, road_table
 from gz_onboard.simulation.scooter import Scooter

@@ -13,11 +13,11 @@ import pytest
 
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
-from gz_onboard.lab.discover.grid import vibration as of_samples
+from gz_onboard.discover.grid import vibration as of_samples
 from gz_onboard.lab.validate_components import battery_voltage, road_load
 from gz_onboard.lab.validate_ride import per_second
+from gz_onboard.model.effect import MOVING, load_effect
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.physics.effect import MOVING, load_effect
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
@@ -31,7 +31,7 @@ BASE = without_cell_effects(read_vehicle("reference"))
 RIDE = LOGS / "coastdown.blf"
 NEWTONS = 8.0  # N per m/s²
 EFFECT = """\"\"\"What a rough road takes, in proportion to the vibration, made up for a test.\"\"\"
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.model.effect import Parameter, Port
 PORT = Port.{port}
 PARAMETERS = (Parameter("{name}_size", "1", {value}, 1.0, 0.0, 50.0, "made up for a test"),)
 def term(vibration, *, {name}_size):

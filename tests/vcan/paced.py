@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from unittest.mock import patch
 
-from gz_onboard.bus.channel import CanChannel
+from gz_onboard.can.channel import CanChannel
 from gz_onboard.cli import main
 from gz_onboard.events import Frame
 from tests.support import EPOCH

@@ -20,7 +20,7 @@ wind_north = { value = 4.0, unit = "m/s", sd = 1.0, status = "guess", source = "
 pack_voltage_latency = { value = 0.1, unit = "s", sd = 0.05, status = "guess", source = "made up for a test" }
 """
 ROUGH = """'''Drag in proportion to the vibration, as discovery writes a curve over it; made up for a test.'''
-from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.model.effect import Parameter, Port
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (Parameter("rough_road_drag", "N·s²/m", 6.0, 1.0, 0.0, 50.0, "made up for a test"),)
 def term(vibration, *, rough_road_drag):

@@ -18,7 +18,7 @@ from statistics import median
 import pytest
 
 from gz_onboard import state
-from gz_onboard.bus.recorder import is_complete
+from gz_onboard.can.recorder import is_complete
 from gz_onboard.events import EFF_FLAG, State
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
 from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 
-from tests.bridges.broker import broker, free_port, listening
+from tests.display.broker import broker, free_port, listening
 from tests.support import LOGS
 from tests.vcan.support import Listener, Running, wait_for
 

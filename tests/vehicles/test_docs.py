@@ -61,7 +61,7 @@ def test_it_names_every_role():
 
 
 @pytest.mark.parametrize(
-    "module", ["bus/mapping", "bus/requests", "vehicle", "physics/riding", "physics/parameters", "physics/tables"]
+    "module", ["can/mapping", "can/requests", "vehicle", "model/riding", "model/parameters", "model/tables"]
 )
 def test_it_names_every_key(module):
     source = (ROOT / "gz_onboard" / f"{module}.py").read_text(encoding="utf-8")

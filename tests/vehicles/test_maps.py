@@ -9,9 +9,9 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
-from gz_onboard.lab.vehicle.maps import BOTH, INVERTER, MOTOR, efficiency_maps, fit_of, modelled, shares
-from gz_onboard.physics.tables import Derating
+from gz_onboard.model.tables import Derating
 from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle_check.maps import BOTH, INVERTER, MOTOR, efficiency_maps, fit_of, modelled, shares
 from tests.support import LOGS
 
 DYNO = LOGS / "calibration" / "motor_dyno.csv.gz"

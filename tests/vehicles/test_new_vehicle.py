@@ -21,10 +21,10 @@ from cantools.database.can import Database
 from gz_onboard import cli
 from gz_onboard.errors import BAD_INPUT, OK, InputError
 from gz_onboard.events import ROLES, Frame, Reason, State
-from gz_onboard.lab.vehicle.cells import NCA
-from gz_onboard.lab.vehicle.kinds import KINDS
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle_check.cells import NCA
+from gz_onboard.vehicle_check.kinds import KINDS
 from tests.support import LOGS, ROOT
 from tests.vehicles.test_scooter_to_van import AIR, BUILDS, GRAVITY, STEP, Build, Truth, encode, speeds
 

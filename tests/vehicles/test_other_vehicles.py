@@ -18,9 +18,9 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
-from gz_onboard.bus.dbc import load_database
-from gz_onboard.bus.mapping import pgn, read_mapping
+from gz_onboard.can.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
+from gz_onboard.can.dbc import load_database
+from gz_onboard.can.mapping import pgn, read_mapping
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.bus.mapping import pgn
-from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.can.dbc import find_dbc, load_database
+from gz_onboard.can.mapping import pgn
+from gz_onboard.can.publisher import Counts, Publisher
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import summary
 from gz_onboard.errors import BAD_INPUT, InputError

@@ -22,10 +22,10 @@ from gz_onboard.estimator.plausibility.residual import (
 )
 from gz_onboard.estimator.signals import TIMING, Signal, Signals
 from gz_onboard.events import CURRENTS, VOLTAGES
-from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.sensors import true_current, true_voltage
+from gz_onboard.model.battery import HALF_FULL, Battery
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.parameters import Parameters
+from gz_onboard.model.sensors import true_current, true_voltage
 
 
 class CurrentSource(Enum):

@@ -23,8 +23,8 @@ from gz_onboard.estimator.plausibility.residual import (
 )
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import SPEEDS
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.sensors import grade_shown, speed_factors
+from gz_onboard.model.effect import MOVING
+from gz_onboard.model.sensors import grade_shown, speed_factors
 
 AXLE = frozenset({"motor_speed", "wheel_speed_rear"})  # turn on a roller bench and in wheelspin
 GROUND = ("wheel_speed_front", "gps_speed")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.publisher import KNOWN
+from gz_onboard.can.publisher import KNOWN
 from gz_onboard.constants import WH
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.events import Activity, Estimate, RouteState, State

@@ -20,7 +20,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistic
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from gz_onboard.bus import logfile
+from gz_onboard.can import logfile
 from gz_onboard.errors import InputError
 from gz_onboard.recording.frames import TIME_LIMIT_NS, FrameColumns
 from gz_onboard.recording.readers.contents import Contents, LogDamage

@@ -8,7 +8,7 @@ from math import exp
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
-from gz_onboard.physics.battery import Battery, current_of
+from gz_onboard.model.battery import Battery, current_of
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gz_onboard.physics.tables import Derating
+from gz_onboard.model.tables import Derating
 
 
 @dataclass

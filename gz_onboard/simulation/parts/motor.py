@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import MutableMapping, Sequence
 from typing import Protocol
 
+from gz_onboard.model.model import Bound
 from gz_onboard.offline.series import stepper
-from gz_onboard.physics.model import Bound
 
 Quantities = MutableMapping[str, float]
 Ledger = MutableMapping[str, float]

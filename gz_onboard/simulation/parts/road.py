@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gz_onboard.physics.functions import direction
+from gz_onboard.model.functions import direction
 
 Place = tuple[float, float, float]
 """(grade as the sine of the road's angle, curvature [1/m] positive to the left, headwind [m/s])."""

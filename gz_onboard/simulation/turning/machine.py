@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from math import ceil, sqrt
 
 from gz_onboard.constants import GRAVITY, MILD
-from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
-from gz_onboard.physics.model import air_density
+from gz_onboard.model.effects import aerodynamic_drag, rolling_resistance
+from gz_onboard.model.model import air_density
 from gz_onboard.simulation.turning.tyre import LateralTyre
 
 MachineState = tuple[float, ...]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.logfile import LogFile
+from gz_onboard.can.logfile import LogFile
 from gz_onboard.estimator.energy_counter import EnergyCounter
 from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.events import Activity, Estimate, State

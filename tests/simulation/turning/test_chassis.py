@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.physics.effects import cornering_drag
+from gz_onboard.model.effects import cornering_drag
 from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.machine import RoadConditions, step
 from gz_onboard.simulation.turning.planar import Planar

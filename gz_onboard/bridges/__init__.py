@@ -1,1 +1,0 @@
-"""Bridges from the range frames to an MQTT broker and to Foxglove."""

@@ -1,0 +1,121 @@
+"""A ride on one grid of a second, and what two signals of it say of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import copysign
+
+import numpy as np
+
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.can.mapping import UNITS, known_units, to_si
+from gz_onboard.discover.grid import averaged, measured
+from gz_onboard.discover.stand_ins import delays
+from gz_onboard.estimator.plausibility.residual import CONFIG
+from gz_onboard.offline.samples import Samples
+from gz_onboard.offline.sensors import true_columns
+from gz_onboard.vehicle import Vehicle
+
+SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each
+FEWEST = 30  # points that two signals must have together before they say anything of each other
+ALIKE = 0.06  # relative: a ratio that is so near that of two units is theirs
+RARER = 0.02  # relative: so much nearer it must be to a power of ten, or to two units that are both not of SI
+UNRELATED = 0.2  # a correlation below says that two signals have nothing to do with each other
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """A ride by role, each signal (n,) at `time` [s] with nan where it was not measured."""
+
+    time: Array
+    columns: Mapping[str, Array]
+
+    def __contains__(self, role: str) -> bool:
+        return role in self.columns
+
+    def __getitem__(self, role: str) -> Array:
+        return self.columns[role]
+
+    def get(self, role: str) -> Array | None:
+        """That of `role`, or None."""
+        return self.columns.get(role)
+
+    def any_of(self, *roles: str) -> list[str]:
+        """Those of `roles` that there are."""
+        return [role for role in roles if role in self.columns]
+
+
+def seconds_of(samples: Samples, vehicle: Vehicle) -> Seconds:
+    """The samples of a ride on the grid, the delays and errors of the sensors that the file knows taken off."""
+    columns = true_columns(samples.columns, vehicle.parameters)
+    late = delays(vehicle)
+    start = min(times[0] for times, _ in columns.values())
+    end = max(times[-1] for times, _ in columns.values())
+    grid = np.arange(start + SECOND, end - SECOND, SECOND)
+    found = {}
+    for role, (times, values) in columns.items():
+        at = grid + late.get(role, 0.0)
+        turned = np.unwrap(values) if role == "gps_course" else values
+        on_grid = np.where(measured(times, at), averaged(times, turned, at, SECOND), np.nan)
+        if np.isfinite(on_grid).any():
+            found[role] = on_grid
+    return Seconds(grid - start, found)
+
+
+def rate(values: Array) -> Array:
+    """Change of `values` (n,) each second; none of a single one, which shows none."""
+    return np.gradient(values, SECOND) if len(values) > 1 else np.zeros_like(values)
+
+
+@dataclass(frozen=True)
+class Relation:
+    """How one signal goes with another: by what factor, how closely, over how many points."""
+
+    factor: float  # of the spreads, with the sign of the correlation
+    correlation: float
+    count: int
+
+
+def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
+    """How `y` goes with `x`, both (n,), `where` (n,) if given; None if there are too few, or one never moves."""
+    known = np.isfinite(x) & np.isfinite(y)
+    known = known & where if where is not None else known
+    if known.sum() < FEWEST:
+        return None
+    a, b = x[known] - x[known].mean(), y[known] - y[known].mean()
+    width, height = float(np.sqrt(np.mean(a * a))), float(np.sqrt(np.mean(b * b)))
+    if width < 1e-9 or height < 1e-9:
+        return None
+    correlation = float(np.mean(a * b)) / (width * height)
+    return Relation(copysign(height / width, correlation), correlation, int(known.sum()))
+
+
+def too_little(speed: Array, what: str) -> str:
+    """Say why `what` cannot be compared: too little motion at this `speed` (n,) [m/s], or they are not there."""
+    moving = int(np.sum(np.abs(speed) > CONFIG.moving_m_s))
+    if moving < FEWEST:
+        return f"the vehicle moves for {moving} s in this log, and {FEWEST} s are needed"
+    return f"{what} are too seldom there together, or do not change"
+
+
+def unit_of(role: str, ratio: float, alike: float = ALIKE) -> str:
+    """What `ratio`, of what `role` shows over what it should show, looks like: units mistaken; empty if like nothing.
+
+    The ratio of a signal in km/h that is taken for m/s is 3.6. The nearest is told. alike: how far a ratio may be from
+    it, relative.
+    """
+    ours, scales = UNITS[role], {}
+    for unit in known_units(role):
+        scales[unit] = (to_si(unit, role) or (1.0, 0.0))[0]
+    said = {}
+    for read, per_read in scales.items():
+        for meant, per_meant in scales.items():
+            if per_read != per_meant:
+                far = abs(ratio * per_meant / per_read - 1) + (RARER if ours not in (read, meant) else 0.0)
+                said[f": that is {meant} taken for {read}"] = far
+    for power in (1000.0, 100.0, 10.0):
+        far = min(abs(ratio / power - 1), abs(ratio * power - 1)) + RARER
+        said[f": a factor of {power:g}, as of a wrong scale in the DBC file"] = far
+    nearest = min(said, key=lambda text: said[text])
+    return nearest if said[nearest] < alike else ""

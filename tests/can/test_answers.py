@@ -1,0 +1,189 @@
+"""Answers out of frames: whole or nothing, whatever is lost, mixed or made up."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.can.codec import LENGTH, RANGE, Codec
+from gz_onboard.can.requests import INTERRUPTED, MALFORMED, SEQUENCE, Assembler
+from gz_onboard.events import Frame
+from gz_onboard.offline.decode_signals import Decoder
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.vehicle import read_vehicle
+from tests.events import Event, events_of
+from tests.polled import KONA, STEADY, answer, carried, exchange, kona, payload, request
+from tests.support import EPOCH, MS, S
+
+PAYLOADS = st.binary(min_size=1, max_size=200)
+BATTERY = request("Battery")
+VALUES = pytest.approx((20.0, 365.0, 20.0, 314.159), rel=1e-4)  # of the roles, as `STEADY` has them
+
+
+class Taken:
+    """What an assembler makes of frames a millisecond apart."""
+
+    def __init__(self, frames: list[bytes], address: int | None = None, step: float = 0.001) -> None:
+        self.faults: Counter[tuple[str, str]] = Counter()
+        assembler = Assembler(address, "", self.faults)
+        taken = (assembler.take(i * step, frame) for i, frame in enumerate(frames))
+        self.answers = [one for one in taken if one is not None]
+
+
+def decoded(frames: list[Frame]) -> tuple[Codec, list[Event]]:
+    codec = Codec(kona().mapping)
+    return codec, events_of(codec, frames)
+
+
+@given(st.lists(PAYLOADS, max_size=5), st.sampled_from([None, 0xF1]))
+def test_what_is_sent_whole_comes_whole(sent, address):
+    taken = Taken([frame for one in sent for frame in carried(one, address)], address)
+    assert taken.answers == sent
+    assert not taken.faults
+
+
+@given(PAYLOADS.filter(lambda p: len(p) > 7), st.data())
+def test_a_frame_that_is_lost_repeated_or_late_leaves_no_answer(sent, data):
+    frames = carried(sent)
+    at = data.draw(st.integers(0, len(frames) - 1))
+    lost = Taken([*carried(b"first"), *frames[:at], *frames[at + 1 :], *carried(b"last")])
+    assert lost.answers == [b"first", b"last"]
+    assert lost.faults.total() == 1  # INTERRUPTED where the last was lost
+    if 0 < at < len(frames) - 1:
+        twice = Taken([*frames[: at + 1], *frames[at:], *carried(b"last")])
+        assert twice.answers == [b"last"]
+        assert twice.faults == {("", SEQUENCE): 1}
+    assert Taken([*frames, *carried(b"last")], step=1.1).answers == [b"last"]
+
+
+@given(st.lists(PAYLOADS.filter(lambda p: len(p) > 7), min_size=2, max_size=2), st.randoms())
+@settings(max_examples=200)
+def test_of_answers_between_each_other_only_whole_ones_are_left(sent, random):
+    left = [carried(one) for one in sent]
+    mixed = []
+    while any(left):
+        mixed.append(random.choice([one for one in left if one]).pop(0))
+    taken = Taken(mixed)
+    assert all(one in sent for one in taken.answers)
+
+
+@given(st.lists(st.tuples(st.floats(0, 2), st.binary(max_size=12)), max_size=60))
+@example([(0.0, b""), (0.0, b"\x10"), (0.0, b"\x10\x07aaaaaa"), (0.0, b"\x00\x20aaaaaa"), (0.0, b"\x3f")])
+def test_any_frames_at_all_give_no_more_than_their_bytes(frames):
+    faults: Counter[tuple[str, str]] = Counter()
+    assembler = Assembler(None, "", faults)
+    seen = b""
+    for time, data in frames:
+        seen += data
+        found = assembler.take(time, data)
+        assert found is None or (found and len(found) <= len(seen))
+    assert {reason for _, reason in faults} <= {SEQUENCE, INTERRUPTED, MALFORMED}
+
+
+def test_another_testers_answers_are_not_ours():
+    assert Taken(carried(b"for another", 0xF4), 0xF1).answers == []
+
+
+def test_the_answer_is_an_event_of_its_last_frame():
+    codec, events = decoded(exchange(BATTERY, EPOCH, **STEADY))
+    (event,) = events
+    assert event[2] == VALUES
+    assert event[0] == pytest.approx(0.018)  # the first frame after 10 ms, eight more
+    assert not codec.faults
+    assert not codec.unknown
+    assert codec.values("Battery", codec.latest["Battery"][2])["BatteryVoltage"] == pytest.approx(365.0)
+
+
+def test_an_answer_is_worth_what_a_frame_is(tmp_path):
+    """The same values at the same times, sent unasked: the estimator cannot tell the difference."""
+    dbc = (
+        'VERSION ""\nBU_: A\nBO_ 256 Own: 7 A\n SG_ I : 7|16@0- (0.1,0) [-400|600] "A" A\n'
+        ' SG_ U : 23|16@0+ (0.1,0) [200|450] "V" A\n SG_ T : 39|8@0- (1,0) [-40|80] "degC" A\n'
+        ' SG_ N : 47|16@0- (1,0) [-12000|12000] "rpm" A\nBA_DEF_ BO_ "GenMsgCycleTime" INT 0 3600000;\n'
+        'BA_ "GenMsgCycleTime" BO_ 256 200;\n'
+    )
+    (tmp_path / "own.dbc").write_text(dbc)
+    text = KONA.read_text(encoding="utf-8")
+    begin, end = text.index("[[request]]"), text.index("[parameters]")
+    roles = '[roles]\npack_current = "I"\npack_voltage = "U"\ncell_temperature = "T"\nmotor_speed = "N"\n'
+    (tmp_path / "own.toml").write_text(f'{text[:begin]}dbc = ["own.dbc"]\n{roles}{text[end:]}')
+    asked, told = Pipeline(kona()), Pipeline(read_vehicle(tmp_path / "own.toml"))
+    for pipeline in (asked, told):
+        pipeline.advance([(EPOCH, 0x555, b"", 0)], EPOCH + MS)  # their clocks begin together
+    for i in range(250):
+        values = STEADY | {"BatteryCurrent": 20.0 + i % 7, "MotorSpeed": 3000 + i}
+        frames = answer(BATTERY, EPOCH + i * S // 5, **values)
+        data = payload(BATTERY, **values)[3:]
+        asked.advance(frames, frames[-1][0] + 60 * MS)
+        told.advance([(frames[-1][0], 0x100, data[10:14] + data[15:16] + data[53:55], 0)], frames[-1][0] + 60 * MS)
+    one, other = asked.last, told.last
+    assert one and other
+    assert one.range and other.range
+    assert (one.soc, one.range, one.distance) == (other.soc, other.range, other.distance)
+
+
+def test_all_ones_are_a_value_and_limits_are_checked():
+    shown = request("BatteryShown")
+    codec, events = decoded(answer(shown, EPOCH, BatteryCharge=100.0))
+    assert events[0][2] == (1.0,)
+    codec, events = decoded(answer(shown, EPOCH, BatteryCharge=127.5))
+    assert events[0][2] == (None,)
+    assert codec.faults == {("BatteryShown.BatteryCharge", RANGE): 1}
+
+
+def test_what_is_no_answer_to_a_request_is_left_alone():
+    other = carried(b"\x59\x02" + bytes(40)) + carried(b"\x62\x01\x02" + bytes(59)) + carried(b"\x62")
+    codec, events = decoded([(EPOCH + i * MS, BATTERY.response, part, 0) for i, part in enumerate(other)])
+    assert not events
+    assert not codec.faults
+    assert not codec.unknown
+
+
+def test_a_wrong_length_is_dropped_and_kept_for_the_check():
+    longer = carried(payload(BATTERY, **STEADY) + b"\0")
+    codec, events = decoded([(EPOCH + i * MS, BATTERY.response, part, 0) for i, part in enumerate(longer)])
+    assert not events
+    assert codec.faults == {("Battery", LENGTH): 1}
+    assert codec.wrong_lengths == {"Battery": 60}
+
+
+def test_a_gateway_that_repeats_the_answer_on_a_second_bus_does_no_harm():
+    frames = exchange(BATTERY, EPOCH, **STEADY)
+    both = sorted([*frames, *((time_ns + MS // 4, i, data, 1) for time_ns, i, data, _ in frames)])
+    codec, events = decoded(both)
+    assert [event[2] for event in events] == [VALUES]
+    assert not codec.faults
+    assert len(decoded([(t, i, data, 1) for t, i, data, _ in frames])[1]) == 1  # a log of that bus alone
+
+
+def test_negative_responses_are_counted_by_their_code():
+    parts = [b"\x7f\x22\x78", b"\x7f\x22\x31", b"\x7f\x22\x31", b"\x7f\x22", b"\x7f"]
+    codec, events = decoded([(EPOCH + i * MS, BATTERY.response, carried(p)[0], 0) for i, p in enumerate(parts)])
+    assert not events
+    assert codec.faults == {("0x7ec", "negative response 0x31"): 2}
+
+
+FRAMES = st.one_of(
+    st.sampled_from(carried(payload(BATTERY, **STEADY))),
+    st.binary(max_size=8),
+    st.just(b"\x30\0\0\xaa\xaa\xaa\xaa\xaa"),
+)
+
+
+@given(st.lists(st.tuples(st.integers(0, S), FRAMES), max_size=40))
+@settings(max_examples=200)
+def test_fuzzed_frames_give_the_right_number_or_none(frames):
+    """Bytes at random can be an answer only if all of it is; a part of one is never filled up by another's."""
+    clock, sent = EPOCH, []
+    for step, data in frames:
+        clock += step
+        sent.append((clock, BATTERY.response, data, 0))
+    genuine = carried(payload(BATTERY, **STEADY))
+    codec, events = decoded(sent)
+    if all(data in genuine or data[:1] == b"\x30" for _, data in frames):
+        assert all(event[2] == VALUES for event in events)
+    assert codec.received == len(sent)
+    assert list(Decoder(kona().mapping).decode([sent])) is not None

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.can import logfile
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from gz_onboard.recording.readers.mcap import decode_block
+
+LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+
+identifiers = st.one_of(
+    st.integers(0, 0x7FF),
+    st.integers(0, 0x7FF).map(lambda i: i | RTR_FLAG),
+    st.integers(0, 0x1FFF_FFFF).map(lambda i: i | EFF_FLAG),
+    st.integers(0, 0x1FFF_FFFF).map(lambda i: i | ERR_FLAG),
+)
+datas = st.sampled_from(LENGTHS).flatmap(lambda n: st.binary(min_size=n, max_size=n))
+times = st.one_of(
+    st.integers(1_700_000_000_000_000_000, 1_700_000_001_000_000_000),  # a clock in ns
+    st.integers(1_700_000_000_000_000, 1_700_000_000_002_000).map(lambda t: t * 1000),  # in µs
+    st.integers(0, 1 << 62),
+)
+frames = st.tuples(times, identifiers, datas, st.integers(0, 255))
+
+
+@given(st.lists(frames, min_size=1, max_size=60))
+def test_blocks_keep_every_frame_exactly(block: list[Frame]) -> None:
+    assert decode_block(logfile.encode_block(block)).tuples() == block
+
+
+@pytest.mark.parametrize("kinds", [255, 256, 257, 300])
+def test_more_kinds_of_frames_than_fit_a_byte(kinds: int) -> None:
+    block = [(i * 1000, i, bytes([i & 0xFF]), 0) for i in range(kinds)] * 2
+    assert decode_block(logfile.encode_block(block)).tuples() == block
+
+
+@pytest.mark.parametrize("step", [1, 32_767, 32_768, (1 << 31) - 1, 1 << 31, 1 << 40])
+def test_steps_of_each_width_forwards_and_back(step: int) -> None:
+    block: list[Frame] = [(t, 1, b"", 0) for t in (10**18, 10**18 + step, 10**18 + step + 1, 10**18 + 1 - step)]
+    assert decode_block(logfile.encode_block(block)).tuples() == block
+
+
+def ride(seconds: float, jitter: bool) -> list[Frame]:
+    """20 messages as on a scooter's bus: slowly moving words, a counter and a checksum."""
+    block = []
+    for tick in range(int(seconds * 500)):
+        identifier = 0x100 + tick % 20
+        word = (1000 + tick // 40 * (1 + tick % 3)).to_bytes(2, "little")
+        data = word + bytes(4) + bytes([tick // 20 % 16])
+        noise = zlib.crc32(tick.to_bytes(4, "little")) % 40_000 if jitter else 0
+        block.append((1_700_000_000_000_000_000 + tick * 2_000_000 + noise, identifier, data + bytes([noise & 7]), 0))
+    return block
+
+
+def test_a_clock_of_microseconds_costs_half_of_one_of_nanoseconds() -> None:
+    fine = ride(1.0, jitter=True)
+    coarse = [(t // 1000 * 1000, i, d, c) for t, i, d, c in fine]
+    assert len(logfile.encode_block(coarse)) == len(logfile.encode_block(fine)) - 2 * (len(fine) - 1)
+
+
+def test_blocks_compress_far_below_the_raw_frames() -> None:
+    block = ride(1.0, jitter=True)
+    assert len(zlib.compress(logfile.encode_block(block))) < 6 * len(block)
+
+
+@given(st.lists(frames, min_size=1, max_size=20), st.data())
+def test_a_cut_block_is_refused(block: list[Frame], data: st.DataObject) -> None:
+    encoded = logfile.encode_block(block)
+    cut = data.draw(st.integers(0, len(encoded) - 1))
+    with pytest.raises(ValueError, match="block"):
+        decode_block(encoded[:cut]).tuples()
+
+
+@given(st.binary(max_size=200))
+def test_rubbish_is_refused_not_decoded(rubbish: bytes) -> None:
+    try:
+        decoded = decode_block(rubbish).tuples()
+    except ValueError:
+        return
+    assert decode_block(logfile.encode_block(decoded)).tuples() == decoded
+
+
+def test_an_empty_block_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        logfile.encode_block([])
+
+
+def test_transmitted_frames_are_told_from_received_ones() -> None:
+    block: list[Frame] = [(1, 0x123, b"\x01", 0), (2, 0x123, b"\x01", TRANSMITTED)]
+    assert [channel for *_, channel in decode_block(logfile.encode_block(block)).tuples()] == [0, TRANSMITTED]

@@ -1,0 +1,253 @@
+"""The live estimate and position, as clients of Foxglove's protocol get them: one written by hand, and its own."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import chain, takewhile
+from typing import Any
+
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from gz_onboard import cli
+from gz_onboard.can._can import can
+from gz_onboard.display import command as dashboard
+from gz_onboard.display import foxglove as command
+from gz_onboard.display.foxglove import LAYOUT
+from gz_onboard.display.vehicle_frames import VehicleFrames
+from gz_onboard.events import EFF_FLAG, Frame
+from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames
+from gz_onboard.vehicle import read_vehicle
+from tests.display import foxglove_clients
+from tests.display.broker import wait_for
+from tests.display.foxglove_clients import CLIENTS, FOLDER, documented
+from tests.display.served import Sender
+from tests.display.test_terminal import ESTIMATE, send
+from tests.support import LOGS
+
+SECONDS = 5
+GPS_MOTION = 1073
+TRUCK_DBC = """VERSION ""
+BO_ 2566845438 VP: 8 Vector__XXX
+ SG_ Latitude : 0|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
+ SG_ Longitude : 32|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
+"""
+TRUCK = """schema = 1
+name = "truck"
+dbc = ["truck.dbc"]
+[bus]
+identifiers = "j1939"
+[roles]
+{roles}
+"""
+
+
+@contextmanager
+def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Iterator[str]:
+    """Its address."""
+    said: list[str] = []
+    stop = threading.Event()
+
+    @contextmanager
+    def stopped(duration: float | None = None) -> Iterator[Any]:
+        end = time.monotonic() + (duration or math.inf)
+        yield lambda: stop.is_set() or time.monotonic() >= end
+
+    monkeypatch.setattr(dashboard, "until_signalled", stopped)
+    monkeypatch.setattr(command, "report", lambda _, text: said.append(text))
+    arguments = ["foxglove", "--interface", "virtual", "--channel", channel, "--listen", "127.0.0.1:0"]
+    thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
+    thread.start()
+    try:
+        wait_for(lambda: bool(said), "it serves")
+        yield said[0].split()[0]
+    finally:
+        stop.set()
+        thread.join()
+
+
+class Kept:
+    """A log that keeps what is declared, and the rows of each topic."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, Any] = {}
+        self.rows: dict[str, list[Any]] = {}
+
+    def channel(self, topic: str, json_schema: Any, metadata: Any = None) -> None:
+        self.of[topic] = json_schema
+
+    def frames(self, batch: Any) -> None:
+        """Nothing."""
+
+    def sample(self, topic: str, time_ns: int, values: Any, seen_ns: Any = None) -> None:
+        self.rows.setdefault(topic, []).append(values)
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_the_estimate_is_that_of_the_log_and_nothing_old(client, monkeypatch):
+    logged = Kept()
+    declare(logged, ())
+    with serving("f1", monkeypatch) as address, client(address, "/estimate") as (channels, heard):
+        assert channels.keys() == {"/estimate"}
+        channel = channels["/estimate"]
+        assert (channel["topic"], channel["encoding"], channel["schemaName"]) == (
+            "/estimate",
+            "json",
+            "gz_onboard.Estimate",
+        )
+        assert json.loads(channel["schema"]) == logged.of["/estimate"]
+        silent = next(heard).row
+        assert silent.keys() == {*ESTIMATE_UNITS, *TEXTS}
+        assert not any(silent[name] is not None for name in ESTIMATE_UNITS)
+        assert silent["state"] == "UNKNOWN"
+        there = replace(ESTIMATE, charge_power=500.0, time_to_full=3600.0, range_full=50_000.0)
+        with Sender("f1", there):
+            _, time_ns, row = next(
+                one for one in heard if all(one.row[name] for name in ("range", "soc", "charge_power", "energy_left"))
+            )
+        assert time_ns > 1e18
+        expected = estimate_row(there)
+        for name in ESTIMATE_UNITS:
+            if row[name] is not None:
+                assert row[name] == pytest.approx(expected[name], rel=1e-3), name
+        said = {name for name in ESTIMATE_UNITS if row[name] is not None}
+        assert {"range", "range_p10", "range_p90", "soc", "soc_sd", "energy_left", "time_to_full", "range_full"} <= said
+        assert {name: row[name] for name in TEXTS} == {name: expected[name] for name in TEXTS}
+        gone = next(one.row for one in heard if one.row["soc"] is None)  # the status is stale after a second
+        assert gone["soc_sd"] is None
+        assert gone["state"] == "UNKNOWN"
+
+
+def test_the_subprotocol_before_the_sdk_is_refused(monkeypatch):
+    """As the documentation says: the reason why the library's own constant is not offered."""
+    monkeypatch.setattr(foxglove_clients, "SUBPROTOCOL", "foxglove.websocket.v1")
+    with (
+        serving("f4", monkeypatch) as address,
+        pytest.raises(InvalidStatus, match="HTTP 400"),
+        documented(address, "/estimate"),
+    ):
+        pass
+
+
+def test_the_library_is_pinned_by_hash_and_by_no_address():
+    lock = json.loads((FOLDER / "package-lock.json").read_text(encoding="utf-8"))
+    packages = [pinned for folder, pinned in lock["packages"].items() if folder]
+    assert packages
+    assert all("integrity" in pinned and "resolved" not in pinned for pinned in packages)
+
+
+def test_a_port_that_is_taken(monkeypatch, capsys):
+    with serving("f2", monkeypatch) as address:
+        place = address.removeprefix("ws://")
+        assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", place]) == 2
+    assert re.search(rf"--listen {place}: .*in use", capsys.readouterr().err)
+    assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", "nowhere"]) == 2
+
+
+@pytest.fixture(scope="module")
+def ridden() -> list[Frame]:
+    """The frames of the first seconds of a recorded ride."""
+    frames = chain.from_iterable(read_frames(LOGS / "city_14C.blf"))
+    first = next(frames)
+    return [first, *takewhile(lambda frame: frame[0] - first[0] < SECONDS * 10**9, frames)]
+
+
+def positions_of(frames: VehicleFrames, ridden: list[Frame]) -> dict[int, Any]:
+    """By their times, each as it came."""
+    found: dict[int, Any] = {}
+    for frame in ridden:
+        frames.take(frame, frame[0] * 1e-9)
+        if place := frames.values(frame[0] * 1e-9)["position"]:
+            found.setdefault(place["time_ns"], place)
+    return found
+
+
+def test_positions_are_those_of_the_log(ridden):
+    logged = Kept()
+    Pipeline(read_vehicle("reference"), log=logged).advance(ridden, ridden[-1][0])
+    found = positions_of(VehicleFrames(read_vehicle("reference"), positions=True), ridden)
+    rows = [location_row(frame="gps", **one) for one in found.values()]
+    once_a_second = logged.rows["/location"]
+    assert len(once_a_second) >= SECONDS - 1
+    at = {(row["timestamp"]["sec"], row["timestamp"]["nsec"]): row for row in rows}
+    assert list(at) == sorted(at)
+    for row in once_a_second:
+        place = at[row["timestamp"]["sec"], row["timestamp"]["nsec"]]
+        assert {**place, "altitude": None} == {**row, "altitude": None}
+        if place is not rows[0]:  # the altitude comes by a message of its own
+            assert place["altitude"] == pytest.approx(row["altitude"], abs=1.0)
+    assert len(rows) > 4 * len(once_a_second)  # each as it comes
+
+
+@pytest.mark.parametrize(("fix", "told"), [(0, None), (1, None), (2, False), (3, True)])
+def test_what_a_fix_tells(ridden, fix, told):
+    """Nothing of one that is none; no altitude of one in two dimensions."""
+    changed = [
+        (t, i, bytes([*data[:6], data[6] & 0b1001_1111 | fix << 5, *data[7:]]) if i == GPS_MOTION else data, channel)
+        for t, i, data, channel in ridden
+    ]
+    found = positions_of(VehicleFrames(read_vehicle("reference"), positions=True), changed)
+    rows = [location_row(frame="gps", **one) for t, one in found.items() if t - ridden[0][0] > 10**9]
+    assert bool(rows) is (told is not None)
+    assert {"altitude" in row for row in rows} <= {told}
+
+
+def test_positions_of_a_truck_whoever_sends_them(tmp_path):
+    """J1939: the source address is not in the DBC file, so the kernel cannot let through the position alone."""
+    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
+    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"\nlongitude = "Longitude"'))
+    positions = VehicleFrames(read_vehicle(tmp_path / "truck.toml"), positions=True)
+    assert positions.identifiers is None
+    place = struct.pack("<II", round((48.1 + 210) * 1e7), round((11.6 + 210) * 1e7))
+    frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
+    (row,) = positions_of(positions, frames).values()
+    assert (row["latitude"], row["longitude"]) == pytest.approx((48.1, 11.6))
+
+
+def test_the_layout_is_written_where_it_is_wanted(tmp_path, capsys):
+    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "layout.json")]) == 0
+    assert (tmp_path / "layout.json").read_bytes() == LAYOUT.read_bytes()
+    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "none" / "layout.json")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+
+
+def test_a_vehicle_without_positions(tmp_path, capsys):
+    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
+    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"'))
+    arguments = ["--interface", "virtual", "--listen", "127.0.0.1:0", "--duration", "0.1"]
+    assert cli.main(["foxglove", *arguments, "--vehicle", str(tmp_path / "truck.toml")]) == 0
+    assert "truck.toml: [roles] must have latitude and longitude: no position is shown" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_positions_live(client, monkeypatch, ridden):
+    vehicle = read_vehicle("reference")
+    identifiers = VehicleFrames(vehicle, positions=True).identifiers or []
+    mine = [frame for frame in ridden if frame[1] in identifiers]
+    rows = positions_of(VehicleFrames(vehicle, positions=True), ridden).values()
+    recorded = {(round(row["latitude"], 7), round(row["longitude"], 7)) for row in rows}
+    began = time.time()
+    with (
+        serving("f3", monkeypatch, "--vehicle", "reference") as address,
+        client(address, "/location", "/estimate") as (channels, heard),
+        can.Bus(interface="virtual", channel="f3") as bus,
+    ):
+        assert channels["/location"]["schemaName"] == "foxglove.LocationFix"
+        assert json.loads(channels["/location"]["schema"]) == LOCATION_SCHEMA
+        assert next(heard).topic == "/estimate"  # comes each second; so what was asked for before is subscribed to, too
+        for start in range(0, 400, 100):
+            send(bus, mine[start : start + 100])
+            _, time_ns, row = next(one for one in heard if one.topic == "/location")
+            assert (row["latitude"], row["longitude"]) in recorded
+            assert began <= row["timestamp"]["sec"] + 1
+            assert began <= time_ns * 1e-9 <= time.time() + 1

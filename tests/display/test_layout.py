@@ -1,0 +1,135 @@
+"""A log as the daemon writes it, as others read it: what the doctor says, positions, and the layout for Foxglove."""
+
+from __future__ import annotations
+
+import json
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from gz_onboard.can.recorder import LogLimits, Recorder
+from gz_onboard.events import Frame
+from gz_onboard.log_rows import LOCATION_SCHEMA, location_row
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.recording.logs import read_frames, read_samples
+from gz_onboard.vehicle import read_vehicle
+from tests.can.doctor import complaints
+from tests.support import LOGS, ROOT
+
+LAYOUT = ROOT / "gz_onboard" / "bridges" / "foxglove_layout.json"
+SECONDS = 120
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of two minutes of a recorded ride, drained ten times a second and synced at odd times."""
+    recorder = Recorder(tmp_path_factory.mktemp("log"), "reference", limits=LogLimits(sync_s=1.3))
+    pipeline = Pipeline(read_vehicle("reference"), log=recorder)
+    tick: list[Frame] = []
+    start = 0
+    for frame in chain.from_iterable(read_frames(LOGS / "city_14C.blf")):
+        start = start or frame[0]
+        if tick and frame[0] - tick[0][0] > 100_000_000:
+            pipeline.advance(tick, tick[-1][0])
+            recorder.sync(tick[-1][0])
+            tick = []
+        tick.append(frame)
+        if frame[0] - start > SECONDS * 10**9:
+            break
+    recorder.close()
+    assert not recorder.errors
+    return recorder.paths[0]
+
+
+def messages(log: Path) -> dict[str, list[dict[str, Any]]]:
+    """Of each JSON topic what another reader finds on it."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    with log.open("rb") as stream:
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            if channel.message_encoding == "json":
+                found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found
+
+
+def test_the_doctor_has_nothing_to_say(log):
+    assert complaints(log) == []
+
+
+def test_the_doctor_sees_a_message_that_is_late(tmp_path):
+    recorder = Recorder(tmp_path, "late")
+    recorder.channel("/a", {"title": "a", "type": "object"})
+    for time_ns in 5, 4:
+        recorder.sample("/a", time_ns * 10**9, {})
+    recorder.close()
+    assert complaints(recorder.paths[0]) == ["/a: 1000000000 ns before the message before it"]
+
+
+def test_positions_are_fixes_that_foxglove_knows(log):
+    found = messages(log)["/location"]
+    assert SECONDS * 0.9 <= len(found) <= SECONDS + 1
+    stamps = [(one["timestamp"]["sec"], one["timestamp"]["nsec"]) for one in found]
+    assert stamps == sorted(set(stamps))
+    recorded = [values for topic, _, values in read_samples(log) if topic == "/can/GPS_Position"]
+    there = {(round(values["GPS_Latitude"], 5), round(values["GPS_Longitude"], 5)) for values in recorded}
+    for one in found:
+        assert one.keys() <= LOCATION_SCHEMA["properties"].keys()
+        assert set(LOCATION_SCHEMA["required"]) <= one.keys()
+        assert (round(one["latitude"], 5), round(one["longitude"], 5)) in there
+    assert any("altitude" in one for one in found)
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    schemas = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
+    assert {schemas["/location"], schemas["/battery_ends"]} == {"foxglove.LocationFix"}
+
+
+def test_an_altitude_that_is_not_known_is_not_there():
+    assert "altitude" not in location_row(1, "gps", 1.0, 2.0, None)
+    assert location_row(1_500_000_000, "gps", 1.0, 2.0, 3.0)["timestamp"] == {"sec": 1, "nsec": 500_000_000}
+
+
+def test_signals_have_the_time_at_which_they_were_seen(log):
+    """The log's own time is that of the second in which they were logged: it does not go back."""
+    late = 0
+    with log.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            if channel.topic.startswith("/can/") and channel.message_encoding == "json":
+                assert 0 <= message.log_time - message.publish_time < 10**9
+                late += message.log_time > message.publish_time
+    assert late
+
+
+def placed(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else [*placed(node["first"]), *placed(node["second"])]
+
+
+def paths(panel: dict[str, Any]) -> list[str]:
+    """The message paths of a panel, and the topics of a map."""
+    found = [path["value"] for path in panel.get("paths", [])]
+    found += [panel[key] for key in ("topicPath", "followTopic") if key in panel]
+    return found + list(panel.get("topicColors", {}))
+
+
+def test_every_panel_of_the_layout_finds_what_it_shows(log):
+    layout = json.loads(LAYOUT.read_text())
+    assert sorted(placed(layout["layout"])) == sorted(layout["configById"])
+    found = messages(log)
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    known = {
+        channel.topic: json.loads(summary.schemas[channel.schema_id].data)["properties"]
+        for channel in summary.channels.values()
+        if channel.message_encoding == "json"
+    }
+    for name, panel in layout["configById"].items():
+        assert paths(panel), name
+        for path in paths(panel):
+            topic, _, field = path.partition(".")
+            assert topic in known, f"{name}: {path}"
+            if field:
+                assert field in known[topic], f"{name}: {path}"
+                assert any(message[field] is not None for message in found[topic]), f"{name}: {path}"

@@ -1,0 +1,281 @@
+"""The bridge to a broker: a real one, a bus in this process, and what a daemon sends."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import pytest
+
+from gz_onboard import cli
+from gz_onboard.display import command as dashboard
+from gz_onboard.display import mqtt
+from gz_onboard.display.broker import Broker, read_login
+from gz_onboard.display.view import View
+from gz_onboard.errors import InputError
+from gz_onboard.events import Activity, State
+from tests.display.broker import Listener, broker, free_port, listening, wait_for
+from tests.display.served import PACK, Sender, cells, odometer
+from tests.display.test_terminal import ESTIMATE
+
+STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
+NUMBERS = [key for key, (_, about) in mqtt.SENSORS.items() if "unit_of_measurement" in about]
+
+
+@contextmanager
+def bridge(port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The command in a thread; gives what it says."""
+    said: list[str] = []
+    stop = threading.Event()
+
+    @contextmanager
+    def stopped(duration: float | None = None) -> Iterator[Any]:
+        end = time.monotonic() + (duration or math.inf)
+        yield lambda: stop.is_set() or time.monotonic() >= end
+
+    monkeypatch.setattr(dashboard, "until_signalled", stopped)
+    monkeypatch.setattr(mqtt, "report", lambda _, text: said.append(text))
+    arguments = ["mqtt", f"127.0.0.1:{port}", "--interface", "virtual", "--channel", channel, "--name", "scooter"]
+    thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
+    thread.start()
+    try:
+        yield said
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def sending(channel: str, **changes: Any) -> Iterator[Sender]:
+    with Sender(channel, replace(ESTIMATE, **changes)) as sender:
+        yield sender
+
+
+def shown(about: dict[str, Any], state: dict[str, Any]) -> dict[str, str]:
+    """What Home Assistant makes of it: the value of each sensor that is available."""
+    rendered = {}
+    for key, sensor in about["components"].items():
+        (availability,) = sensor["availability"]
+        there = jinja2.Template(availability["value_template"]).render(value_json=state)
+        assert there in ("online", "offline")  # what Home Assistant expects, unless it is told others
+        assert availability["topic"] == about["state_topic"]
+        if there == "online":
+            rendered[key] = jinja2.Template(sensor["value_template"]).render(value_json=state)
+    return rendered
+
+
+def seen(listener: Listener) -> dict[str, str]:
+    return shown(listener.last[ABOUT], listener.last[STATE]) if {ABOUT, STATE} <= listener.last.keys() else {}
+
+
+def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path, monkeypatch):
+    port = free_port()
+    with broker(tmp_path, port), listening(port) as listener, bridge(port, "m1", monkeypatch=monkeypatch) as said:
+        wait_for(lambda: STATE in listener.last, "a state")
+        assert seen(listener) == {"alert": "silent"}
+        with sending("m1") as sender:
+            wait_for(lambda: {"range", "state_of_charge", "energy_left"} <= seen(listener).keys(), "the range")
+            found = seen(listener)
+            assert float(found["range"]) == 34.21
+            assert float(found["range_p10"]) == 26.54
+            assert float(found["state_of_charge"]) == 62.4
+            assert found["state"] == "degraded"
+            assert found["activity"] == "riding"
+            assert found["alert"] == "none"
+            assert found["reasons"] == "no_imu, prior_riding"
+            assert "charge_power" not in found
+            sender.estimate = replace(ESTIMATE, activity=Activity.CHARGING, charge_power=500.0, time_to_full=3600.0)
+            wait_for(lambda: seen(listener).get("time_to_full") == "60.0", "the charge")
+            sender.estimate = replace(ESTIMATE, state=State.INVALID, range=None, range_p10=None, range_p90=None)
+            wait_for(lambda: seen(listener).get("alert") == "range_invalid", "an estimate that is not valid")
+            assert not {"range", "range_p10", "range_p90"} & seen(listener).keys()
+        wait_for(lambda: seen(listener) == {"alert": "silent"}, "nothing of a daemon that is gone")
+        # who comes later is told the same
+        with listening(port) as late:
+            wait_for(lambda: {STATE, ABOUT} <= late.last.keys(), "what was kept")
+            assert not [key for key in NUMBERS if late.last[STATE][key] is not None]
+        assert said == [f"connected to the broker 127.0.0.1:{port}"]
+    assert {topic for topic, _ in listener.heard} == {STATE, ABOUT}
+    assert listener.last[STATE]["status"] == "offline"
+    assert said == [f"connected to the broker 127.0.0.1:{port}"]  # that the bridge is ended says nothing of the broker
+
+
+def test_the_vehicles_own_frames(tmp_path, monkeypatch):
+    """Read by its file: the reference scooter's, where nothing else is said."""
+    port = free_port()
+    sender = Sender("m6", ESTIMATE, [PACK, odometer(1012.4), cells(22, 24, 53)])
+    with broker(tmp_path, port), listening(port) as listener, bridge(port, "m6", monkeypatch=monkeypatch), sender:
+        wait_for(lambda: seen(listener).get("alert") == "cell_too_hot", "a hot cell")
+        found = seen(listener)
+        assert [float(found[f"cell_temperature_{end}"]) for end in ("coldest", "hottest")] == [22.0, 53.0]
+        assert float(found["odometer"]) == 1012.4
+    assert seen(listener) == {}
+
+
+def test_of_a_bridge_that_is_killed_no_number_is_left(tmp_path):
+    """A process of its own. It is killed on a bus that nobody else is on, so its state is rewritten as if of a ride."""
+    port = free_port()
+    command = [sys.executable, "-m", "gz_onboard", "mqtt", f"127.0.0.1:{port}", "--name", "scooter"]
+    with broker(tmp_path, port), listening(port) as listener, ExitStack() as stack:
+        process = stack.enter_context(
+            subprocess.Popen([*command, "--interface", "virtual", "--channel", "k"], stdout=subprocess.PIPE, text=True)
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"mqtt: connected to the broker 127.0.0.1:{port}\n"
+        wait_for(lambda: listener.last.get(STATE, {}).get("status") == "online", "it is there")
+        kept = {**listener.last[STATE], "range": 12.3}
+        listener.client.publish(STATE, json.dumps(kept), retain=True)
+        wait_for(lambda: (STATE, kept) in listener.heard, "a number in the state")
+        os.kill(process.pid, signal.SIGKILL)
+        wait_for(lambda: listener.last[STATE]["status"] == "offline", "the last will")
+        assert not [key for key in NUMBERS if listener.last[STATE][key] is not None]
+        with listening(port) as late:
+            wait_for(lambda: STATE in late.last, "what was kept")
+            assert late.last[STATE]["status"] == "offline"
+
+
+def test_a_broker_that_is_not_there_and_goes_away(tmp_path, monkeypatch):
+    port = free_port()
+    monkeypatch.setattr("gz_onboard.display.broker.RETRY_S", (1, 2))
+    there = f"connected to the broker 127.0.0.1:{port}"
+    with bridge(port, "m2", monkeypatch=monkeypatch) as said, sending("m2"):
+        wait_for(lambda: bool(said), "that it is away is said")
+        (text,) = said
+        assert text.startswith(f"the broker 127.0.0.1:{port} cannot be reached: Connection refused")
+        with broker(tmp_path, port):
+            wait_for(lambda: said[-1] == there, "it is found")
+            assert len(said) == 2  # the attempts in between are not said
+            with listening(port) as listener:
+                wait_for(lambda: "range" in seen(listener), "the range")
+        wait_for(lambda: any("is gone" in line for line in said), "that it is gone is said")
+        with broker(tmp_path, port), listening(port) as listener:
+            wait_for(lambda: "range" in seen(listener), "the range again, to a broker that had forgotten all")
+    assert said.count(there) == 2
+
+
+def test_the_state_does_not_outlive_who_says_it(tmp_path, monkeypatch):
+    """A last will is lost with a broker that loses power; what it kept until then must end by itself."""
+    monkeypatch.setattr(mqtt, "EXPIRES_S", 2)
+    monkeypatch.setattr(mqtt, "AT_LEAST_S", 1000.0)
+    port = free_port()
+    with broker(tmp_path, port), bridge(port, "m3", monkeypatch=monkeypatch):
+        with listening(port) as listener:
+            wait_for(lambda: STATE in listener.last, "a state")
+
+        def forgotten() -> bool:
+            with listening(port) as late:
+                wait_for(lambda: ABOUT in late.last, "what is kept for ever")
+                done = threading.Event()
+                late.client.on_publish = lambda *_: done.set()
+                late.client.publish("end", "{}", qos=1)
+                wait_for(lambda: "end" in late.last, "all that is kept has come before")
+                return STATE not in late.last
+
+        wait_for(forgotten, "the state is forgotten")
+
+
+def test_user_and_password(tmp_path, monkeypatch):
+    port = free_port()
+    passwords = tmp_path / "passwords"
+    passwords.write_text("rider:secret\n")
+    subprocess.run(["mosquitto_passwd", "-U", passwords], check=True)
+    login = tmp_path / "login.toml"
+    login.write_text('user = "rider"\npassword = "wrong"\n')
+    login.chmod(0o600)
+    settings = "allow_anonymous false", f"password_file {passwords}"
+    with broker(tmp_path, port, *settings), listening(port, ("rider", "secret")) as listener:
+        with bridge(port, "m4", "--login", str(login), monkeypatch=monkeypatch) as said:
+            wait_for(lambda: bool(said), "that it is refused")
+            assert re.search("refuses us: (Bad user name or password|Not authorized)", said[0])
+        login.write_text('user = "rider"\npassword = "secret"\n')
+        with bridge(port, "m4", "--login", str(login), monkeypatch=monkeypatch):
+            wait_for(lambda: STATE in listener.last, "a state")
+
+
+def test_encrypted(tmp_path, monkeypatch):
+    port = free_port()
+    made = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=localhost"
+    files = ["-keyout", str(tmp_path / "key.pem"), "-out", str(tmp_path / "cert.pem")]
+    names = ["-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost"]
+    subprocess.run([*made.split(), *files, *names], check=True, capture_output=True)
+    settings = "allow_anonymous true", f"certfile {tmp_path}/cert.pem", f"keyfile {tmp_path}/key.pem"
+    with broker(tmp_path, port, *settings):
+        with bridge(port, "m5", "--tls", str(tmp_path / "cert.pem"), monkeypatch=monkeypatch) as said:
+            wait_for(lambda: bool(said), "an answer")
+            assert said == [f"connected to the broker 127.0.0.1:{port}"]
+        with bridge(port, "m5", "--tls", monkeypatch=monkeypatch) as said:
+            wait_for(lambda: bool(said), "an answer")
+            assert "cannot be reached: " in said[0]
+            assert "certificate" in said[0].lower()
+
+
+def test_units_and_classes_go_together():
+    """As Home Assistant's documentation has them; a pair that it does not know makes it drop the sensor."""
+    known = {"distance": "km", "battery": "%", "energy_storage": "Wh", "energy_distance": "Wh/km", "power": "W"}
+    known |= {"duration": "min", "temperature": "°C"}
+    about: Any = mqtt.discovery("scooter", STATE)
+    assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(mqtt.SENSORS)
+    for key, sensor in about["components"].items():
+        assert re.fullmatch("[a-z0-9_]+", key)
+        assert not hasattr(dict, key), "a template would find the method"
+        kind = sensor.get("device_class")
+        if kind == "enum":
+            assert "state_class" not in sensor
+            assert sensor["options"]
+        elif kind:
+            assert sensor["unit_of_measurement"] == known[kind]
+            assert sensor["state_class"] == ("total_increasing" if key == "odometer" else "measurement")
+
+
+def test_each_value_of_a_picture_has_a_sensor():
+    picture = View().picture(0.0, "a", "virtual", True)
+    assert mqtt.state_of(picture).keys() - {"status"} == mqtt.SENSORS.keys()
+    long = mqtt.state_of(picture | {"state": "degraded", "reasons": ["no_imu"] * 100})["reasons"]
+    assert len(long) <= 255
+    assert set(long.split(", ")) == {"no_imu"}
+
+
+def broker_at(text: str, tls: str | None = None) -> Broker:
+    return Broker(text, "scooter", ("hello", b""), ("will", b""), print, tls=tls)
+
+
+@pytest.mark.parametrize("text", ["", "broker:", "broker:0", "broker:99999", "mqtt://broker", "a b", "::1"])
+def test_what_is_no_address(text):
+    with pytest.raises(InputError, match="must be HOST"):
+        broker_at(text)
+
+
+def test_addresses():
+    assert str(broker_at("broker.local")) == "the broker broker.local:1883"
+    assert str(broker_at("broker", "")) == "the broker broker:8883"
+    assert str(broker_at("[::1]:1884")) == "the broker [::1]:1884"
+
+
+def test_a_login_that_others_can_read(tmp_path: Path):
+    file = tmp_path / "login.toml"
+    file.write_text('user = "a"\npassword = "b"\n')
+    file.chmod(0o640)
+    with pytest.raises(InputError, match="chmod 600"):
+        read_login(file)
+
+
+def test_an_empty_login_is_none(tmp_path: Path):
+    file = tmp_path / "login.toml"
+    file.touch(0o600)
+    assert read_login(file) == (None, None)
+    file.write_text('user = "a"\n')
+    with pytest.raises(InputError, match="password: is missing"):
+        read_login(file)

@@ -1,0 +1,579 @@
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard import cli
+from gz_onboard.can._can import can
+from gz_onboard.can.dbc import find_dbc
+from gz_onboard.can.publisher import Counts, Publisher
+from gz_onboard.display import terminal
+from gz_onboard.display.view import Picture, View
+from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State, words
+
+REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
+ESTIMATE = Estimate(
+    time=1.0,
+    activity=Activity.RIDING,
+    state=State.DEGRADED,
+    reasons=REASONS,
+    soc=0.624,
+    soc_sd=0.012,
+    range=34_210.0,
+    range_p10=26_540.0,
+    range_p90=44_340.0,
+    energy_left=895 * 3600.0,
+    consumption_recent=24.6 * 3.6,
+    consumption_expected=26.2 * 3.6,
+    why=Explanation(
+        1.0, 57_600.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
+    ),
+)
+COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
+
+
+def second(publisher: Publisher, estimate: Estimate = ESTIMATE) -> list[Frame]:
+    """What the daemon sends in a second."""
+    frames = publisher.range(estimate, COUNTS, 0)
+    for _ in range(10):
+        frames += publisher.status(estimate, 0)
+    return frames
+
+
+def seen(estimate: Estimate = ESTIMATE, now: float = 100.0) -> View:
+    view = View()
+    for frame in second(Publisher(), estimate):
+        view.take(frame, now)
+    return view
+
+
+def at(view: View, now: float) -> Picture:
+    return view.picture(now, "vcan0", "virtual", True)
+
+
+def drawn(view: View, now: float, width: int = 80, *, colour: bool = False) -> str:
+    lines = terminal.screen(at(view, now), width, view.comments)
+    return "\n".join(terminal.rendered(line, width, colour) for line in lines)
+
+
+def numbers(text: str) -> list[str]:
+    """The quantities in a picture; that the interval is one of 80 % is none."""
+    return re.findall(r"\d (?:km|Wh|%)", text.replace("80 %: ", ""))
+
+
+def test_it_shows_what_the_daemon_sends():
+    text = drawn(seen(), 100.0)
+    for shown in (
+        "34.2 km",
+        "26.5 km to 44.3 km",
+        "62.4 ± 1.2 %",
+        "895 Wh",
+        "26.2 Wh/km expected",
+        "24.6 Wh/km over",
+        "Why               temperature -3.4 km, stops +1.6 km\n                    besides the charge; rated 57.6 km",
+        "degraded",
+        "no IMU: No lean",
+        "less than 3 km ridden",
+        "0.0 s old, 17 received, 0 lost, 0 bad",
+        "Activity          riding",
+        "7 dropped, 3 implausible, 24 lost, 2 unknown",
+    ):
+        assert shown in text
+    assert "Stale" not in text
+
+
+def test_reasons_of_a_valid_estimate_widen_its_interval():
+    view = seen(replace(ESTIMATE, state=State.VALID, reasons=Reason.PRIOR_RIDING))
+    assert "Wider interval    less than 3 km ridden" in drawn(view, 100.0)
+
+
+@pytest.mark.parametrize("state", [State.VALID, State.DEGRADED])
+def test_what_cannot_be_kept_makes_no_range_less_certain(state):
+    reasons = Reason.LOG_FAILED | Reason.SAVE_FAILED | (Reason.SOC_RESTARTED if state is State.DEGRADED else Reason(0))
+    view = seen(replace(ESTIMATE, state=state, reasons=reasons))
+    text = drawn(view, 100.0)
+    assert "Note              log failed" in text
+    assert "Wider interval" not in text
+    assert ("Because           SOC restarted" in text) is (state is State.DEGRADED)
+
+
+def test_a_scooter_that_is_not_on_is_waited_for():
+    view = seen(Estimate(time=0.0, state=State.INVALID, reasons=NO_SENSOR | Reason.LOG_FAILED))
+    text = drawn(view, 100.0)
+    assert "State             waiting for the scooter" in text
+    assert "Note              log failed" in text
+    assert not re.search("no IMU|Because|invalid", text)
+
+
+def test_an_old_number_is_never_shown_as_if_fresh():
+    view = seen(now=100.0)
+    assert "62.4" in drawn(view, 100.9)
+    after = drawn(view, 101.1)  # ten periods of RANGE_Status
+    assert "62.4" not in after
+    assert re.search(r"Stale +RANGE_Status\n", after)
+    assert "34.2 km" in after
+    for late in 110.1, 1e4, 1e9:
+        text = drawn(view, late)
+        assert not numbers(text)
+        assert "unknown" in text
+        assert all(f" {name}\n" in text for name in view.messages)
+
+
+def test_a_late_number_is_grey():
+    grey, fresh = "\x1b[2m34.2 km", "\x1b[1;33m34.2 km"
+    assert fresh in drawn(seen(), 100.2, colour=True)
+    assert grey in drawn(seen(), 104.0, colour=True)
+
+
+def test_nothing_yet():
+    text = drawn(View(), 5.0)
+    assert "none yet" in text
+    assert "No frame of       range.dbc" in text
+    assert "Is --dbc its range_dbc?" in text
+    assert not numbers(text)
+
+
+@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
+def test_without_an_estimate_there_are_dashes(state):
+    text = drawn(seen(Estimate(time=1.0, state=state)), 100.0)
+    assert not numbers(text)
+    assert state.name.lower() in text
+
+
+@pytest.mark.parametrize("heard", [False, True])
+def test_before_the_first_range_it_is_starting(heard):
+    """The status is sent ten times as often as the range, which has not come, or still says that there is none."""
+    view, publisher = View(), Publisher()
+    frames = publisher.range(Estimate(time=0.0), COUNTS, 0) if heard else []
+    for frame in [*frames, *publisher.status(replace(ESTIMATE, state=State.VALID), 0)]:
+        view.take(frame, 1.0)
+    text = drawn(view, 1.0)
+    assert "State             starting" in text
+    assert "Activity" not in text
+    for frame in publisher.range(replace(ESTIMATE, state=State.VALID), COUNTS, 0):
+        view.take(frame, 1.1)
+    assert "State             valid" in drawn(view, 1.1)
+    for frame in publisher.status(replace(ESTIMATE, state=State.INVALID), 0):  # bad news is shown at once
+        view.take(frame, 1.2)
+    text = drawn(view, 1.2)
+    assert "State             invalid" in text
+    assert "expected, – over the last km" in text  # the last kilometre was ridden who knows when
+
+
+@pytest.mark.parametrize("activity", Activity)
+def test_what_the_vehicle_does(activity):
+    view = seen(replace(ESTIMATE, activity=activity))
+    text = drawn(view, 100.0)
+    if activity is Activity.UNKNOWN:
+        assert "Activity" not in text
+    else:
+        assert f"Activity          {activity.name.lower()}\n" in text
+    assert "Activity" not in drawn(view, 1e4)
+
+
+def test_sensors_left_out_are_named():
+    reasons = Reason.SENSOR_DISTRUSTED | Reason.SIGNALS_SLOW | Reason.SOC_RESTARTED | Reason.SAVE_FAILED
+    view = seen(replace(ESTIMATE, reasons=reasons, distrusted=("accel_x", "gps_altitude", "bms_state_of_charge")))
+    text = drawn(view, 100.0)
+    assert "Sensors left out  acceleration x, GPS altitude, BMS state of charge\n" in text
+    for shown in "sensor distrusted", "signals slow", "SOC restarted", "save failed":
+        assert shown in text
+    assert "GPS altitude" not in drawn(view, 111.0)  # stale
+
+
+def test_all_sensors_left_out_take_several_lines():
+    sendable = [s.name for s in Publisher().messages["RANGE_Sensors"].signals if s.length == 1]
+    view = seen(replace(ESTIMATE, distrusted=tuple(ROLES)))
+    assert len(at(view, 100.0)["distrusted"]) == len(sendable) > 20
+    text = drawn(view, 100.0)
+    assert "…" not in text
+    assert all(words(role) in re.sub(r"\s+", " ", text) for role in at(view, 100.0)["distrusted"])
+
+
+# --- range frames of another file ---------------------------------------------------------------------------------
+
+
+VAN = replace(
+    ESTIMATE,
+    range=412e3,
+    range_p10=365e3,
+    range_p90=466e3,
+    energy_left=54_500 * 3600.0,
+    consumption_recent=718 * 3.6,
+    consumption_expected=132 * 3.6,
+)
+
+
+def test_large_frames_by_their_own_file():
+    file = find_dbc("range_large.dbc")
+    view = View(Publisher(file))
+    for frame in second(Publisher(file), VAN):
+        view.take(frame, 100.0)
+    text = drawn(view, 100.0)
+    for shown in "412.0 km", "365.0 km to 466.0 km", "54500 Wh", "132.0 Wh/km expected", "718.0 Wh/km over":
+        assert shown in text
+
+
+@pytest.mark.parametrize(("sent", "read"), [("range.dbc", "range_large.dbc"), ("range_large.dbc", "range.dbc")])
+def test_by_the_wrong_file_there_is_nothing_rather_than_wrong_numbers(sent, read):
+    view = View(Publisher(find_dbc(read)))
+    for frame in second(Publisher(find_dbc(sent))):
+        view.take(frame, 100.0)
+    text = drawn(view, 100.0)
+    assert not numbers(text)
+    assert f"No frame of       {read}" in text
+
+
+def test_29_bits_and_a_counter_of_16(tmp_path):
+    file = tmp_path / "mine.dbc"
+    text = find_dbc("range.dbc").read_text().replace("1536", str(0x18FF6000 | 1 << 31)).replace("[0|14]", "[0|15]")
+    file.write_text(text.replace('BA_ "GenMsgCycleTime" BO_ 1538 100;', ""))
+    publisher, view = Publisher(file), View(Publisher(file))
+    for i in range(40):
+        for frame in second(publisher):
+            view.take(frame, 100.0 + i)
+    assert {entry.lost for entry in view.messages.values()} == {0}
+    assert {entry.bad for entry in view.messages.values()} == {0}
+    assert at(view, 140.0)["range"]["km"] == pytest.approx(34.21)
+    assert view.messages["RANGE_Status"].period == 0.1  # though its file does not say so
+
+
+def test_a_broken_frame_is_counted_and_not_shown():
+    publisher, view = Publisher(), View()
+    frame = publisher.range(ESTIMATE, COUNTS, 0)[0]
+    time_ns, identifier, data, channel = frame
+    for broken in (bytes([data[0] ^ 1]) + data[1:], data[:7], data + b"\0", b"", data[:-1] + bytes([data[-1] ^ 0x80])):
+        view.take((time_ns, identifier, broken, channel), 1.0)
+    assert view.messages["RANGE_Estimate"].bad == 5
+    assert at(view, 1.0)["range"]["km"] is None
+    view.take(frame, 1.0)
+    assert at(view, 1.0)["range"]["km"] == pytest.approx(34.21)
+    assert "5 bad" in drawn(view, 1.0)
+
+
+def test_counters():
+    publisher, view = Publisher(), View()
+    frames = [publisher.status(ESTIMATE, 0)[0] for _ in range(40)]
+    now = 0.0
+    for i, frame in enumerate(frames):
+        now += 0.1
+        if i not in (14, 15, 33):  # across the wrap too
+            view.take(frame, now)
+    entry = view.messages["RANGE_Status"]
+    assert (entry.received, entry.lost, entry.bad) == (37, 3, 0)
+    for _ in range(30):  # a sender that hangs and repeats its last frame
+        now += 0.1
+        view.take(frames[-1], now)
+    assert entry.bad >= 9
+    assert entry.bad + entry.received == 67
+    # It is stale in between; taken again only as after a pause, when the daemon may have been started anew.
+    assert at(view, entry.time + 1.05)["battery"]["soc_percent"] is None
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.integers(0x5FE, 0x606), st.integers(0, 2**32 - 1)), st.binary(max_size=12), st.floats(0, 20)
+        ),
+        max_size=40,
+    ),
+    st.booleans(),
+)
+def test_nothing_on_the_bus_breaks_it(frames, checksum):
+    from gz_onboard.can.layout import crc8_sae_j1850
+
+    view, now = View(), 0.0
+    for identifier, data, pause in frames:
+        now += pause
+        if checksum and data:  # random, and yet passing the check
+            view.take((0, identifier, data[:-1] + bytes([crc8_sae_j1850(data[:-1])]), 0), now)
+        view.take((0, identifier, data, 0), now)
+        for width in 10, 80, 300:
+            for line in drawn(view, now, width).splitlines():
+                assert len(line) <= width
+
+
+@given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(1, 120))
+def test_every_line_fits(soc, sd, metres, width):
+    estimate = Estimate(
+        time=1.0,
+        state=State.VALID,
+        reasons=~Reason(0),
+        distrusted=tuple(ROLES),
+        soc=soc,
+        soc_sd=sd,
+        range=metres,
+        range_p10=metres * 0.7,
+        range_p90=metres * 1.4,
+        energy_left=metres * 90,
+    )
+    for line in drawn(seen(estimate), 100.0, width).splitlines():
+        assert len(line) <= min(width, 78)
+
+
+def test_without_colour_there_are_no_codes():
+    assert "\x1b" not in drawn(seen(), 100.0)
+
+
+# --- the command, on python-can's in-process bus ------------------------------------------------------------------
+
+
+@pytest.fixture
+def sender():
+    with can.Bus(interface="virtual", channel="dashboard", preserve_timestamps=False) as bus:
+        yield bus
+
+
+def send(bus, frames):
+    for _, identifier, data, _ in frames:
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+
+def test_once(capsys):
+    import threading
+
+    def sending():
+        publisher = Publisher()
+        with can.Bus(interface="virtual", channel="once") as bus:
+            while not stop.wait(0.05):
+                send(bus, second(publisher))
+
+    stop = threading.Event()
+    thread = threading.Thread(target=sending)
+    thread.start()
+    try:
+        status = cli.main(["dashboard", "--interface", "virtual", "--channel", "once", "--once"])
+    finally:
+        stop.set()
+        thread.join()
+    text = capsys.readouterr().out
+    assert status == 0
+    assert "34.2 km" in text
+    assert "\x1b" not in text
+
+
+def test_once_without_frames(capsys):
+    started = time.monotonic()
+    arguments = ["dashboard", "--interface", "virtual", "--channel", "none", "--once", "--duration", "0.3"]
+    assert cli.main(arguments) == 1
+    assert 0.2 < time.monotonic() - started < 2
+    assert "none yet" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--duration", "0"], "--duration 0"),
+        (["--interface", "nonesuch"], "--interface nonesuch"),
+        (["--interface", "virtual", "--onse"], "--once"),
+        (["--dbc", "range_larg.dbc"], "did you mean 'range_large.dbc'"),
+        (["--dbc", "vehicle.dbc"], "vehicle.dbc: has no message RANGE_Estimate"),
+        (["--dbc", "."], "is a folder; give the DBC file"),
+    ],
+)
+def test_wrong_use_is_told(arguments, told, capsys):
+    try:
+        status = cli.main(["dashboard", *arguments])
+    except SystemExit as error:
+        status = int(str(error.code))
+    assert status == 2
+    assert told in capsys.readouterr().err
+
+
+# A process of its own with a daemon's frames on a virtual bus, which does not leave its process.
+CHILD = """
+import sys, threading, time
+from gz_onboard import cli
+from gz_onboard.can._can import can
+from tests.display.test_terminal import second, send
+from gz_onboard.can.publisher import Publisher
+
+def sending():
+    publisher = Publisher()
+    with can.Bus(interface="virtual", channel="x") as bus:
+        end = time.monotonic() + float(sys.argv[1])
+        while time.monotonic() < end:
+            bus.send(can.Message(arbitration_id=0x600, data=bytes(12), is_fd=True, is_extended_id=False))
+            send(bus, [(0, 0x602, b"nonsense", 0), (0, 0x601, b"", 0), (0, 0x123, b"x", 0)])
+            send(bus, second(publisher))
+            time.sleep(0.1)
+        time.sleep(60)
+
+threading.Thread(target=sending, daemon=True).start()
+sys.exit(cli.main(["dashboard", "--interface", "virtual", "--channel", "x", *sys.argv[2:]]))
+"""
+
+
+def start(*arguments, out, sending=60.0, **environment):
+    inherited = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")}  # pytest's workers have these
+    environment = {**inherited, "TERM": "xterm", "PYTHONPATH": str(Path(__file__).resolve().parents[2]), **environment}
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(sending), *arguments],
+        stdin=out,
+        stdout=out,
+        stderr=subprocess.PIPE,
+        env=environment,
+        start_new_session=True,
+    )
+
+
+class Terminal:
+    """A pseudo-terminal that keeps what was written to it."""
+
+    def __init__(self, rows=24, columns=80):
+        self.master, self.slave = pty.openpty()
+        fcntl.ioctl(self.slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+        self.before = termios.tcgetattr(self.slave)
+        self.text = ""
+
+    def read(self, seconds):
+        if select.select([self.master], [], [], seconds)[0]:
+            self.text += os.read(self.master, 65536).decode("utf-8", "replace")
+
+    def until(self, pattern, within=20.0):
+        end = time.monotonic() + within
+        while not re.search(pattern, self.text):
+            assert time.monotonic() < end, f"no {pattern} in ...{self.text[-2000:]!r}"
+            self.read(0.2)
+
+    def close(self):
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@pytest.fixture
+def tty():
+    opened = Terminal()
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_on_a_terminal_and_left_as_it_was(tty, number):
+    child = start(out=tty.slave)
+    tty.until(r"34\.2 km")
+    tty.until("[1-9] bad")
+    assert tty.text.startswith("\x1b[?1049h\x1b[?25l")  # the other screen, no cursor
+    assert "\x1b[1;33m" in tty.text
+    frames = tty.text.count("\x1b[H")
+    tty.read(1.0)
+    child.send_signal(number)
+    tty.until(r"\x1b\[\?25h\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    for _ in range(5):
+        tty.read(0.1)
+    assert frames >= 1
+    rest = tty.text.split("\x1b[?1049l")[1]
+    assert "34.2 km" in rest  # the last picture stays
+    assert termios.tcgetattr(tty.slave) == tty.before
+    assert child.stderr.read() == b""
+    child.stderr.close()
+
+
+def test_no_picture_is_larger_than_the_terminal():
+    small = Terminal(rows=8, columns=40)
+    child = start("--duration", "2", out=small.slave)
+    small.until(r"\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    pictures = small.text.split("\x1b[?1049l")[0].split("\x1b[H")[1:]
+    assert len(pictures) >= 2
+    for text in pictures:
+        lines = re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", text))
+        assert len(lines) <= 8
+        assert max(map(len, lines)) <= 40
+    child.stderr.close()
+    small.close()
+
+
+def test_a_terminal_that_is_resized(tty):
+    child = start("--duration", "30", out=tty.slave)
+    tty.until(r"34\.2 km")
+    fcntl.ioctl(tty.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 5, 11, 0, 0))
+    tty.read(0.5)
+    tty.text = ""
+    tty.until(r"(?s)\x1b\[H.*\x1b\[H.*\x1b\[H")  # whole pictures after the first, which may be of the old size
+    child.send_signal(signal.SIGINT)
+    tty.until(r"\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    screens = tty.text.split("\x1b[?1049l")[0].split("\x1b[H")[2:]
+    for lines in (re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", text)) for text in screens):
+        assert len(lines) <= 5
+        assert max(map(len, lines)) <= 11
+    child.stderr.close()
+
+
+def test_no_color_and_a_daemon_that_goes_silent(tty):
+    child = start("--duration", "4", out=tty.slave, sending=0.3, NO_COLOR="1")
+    tty.until(r"Stale +RANGE_Status", within=30)
+    assert child.wait(20) == 0
+    assert not re.search(r"\x1b\[[\d;]*[1-9][\d;]*m", tty.text)
+    child.stderr.close()
+
+
+def test_lines_where_there_is_no_terminal(tmp_path):
+    with (tmp_path / "out").open("w+") as out:
+        child = start("--duration", "3.5", out=out, PYTHONIOENCODING="ascii")
+        assert child.wait(30) == 0
+        assert child.stderr.read() == b""
+        child.stderr.close()
+        out.seek(0)
+        lines = out.read().splitlines()
+    assert 2 <= len(lines) <= 4
+    assert json.loads(lines[-1])["range"]["km"] == 34.21
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "told"), [(">&-", 2, "no standard output"), (">/dev/full", 1, "No space left")]
+)
+def test_an_output_that_takes_nothing_is_told(redirection, status, told):
+    command = f'"$0" -m gz_onboard dashboard --interface virtual --channel none --duration 1.5 {redirection}'
+    run = subprocess.run(["sh", "-c", command, sys.executable], stderr=subprocess.PIPE, text=True, check=False)
+    assert run.returncode == status
+    assert run.stderr.startswith("gz-onboard dashboard: ")
+    assert told in run.stderr
+    assert len(run.stderr.splitlines()) == 1
+
+
+def test_a_dumb_terminal_gets_lines(tty):
+    child = start("--duration", "2.5", out=tty.slave, TERM="dumb")
+    tty.until(r'"range":{"km":34.21')
+    assert child.wait(10) == 0
+    assert "\x1b" not in tty.text
+    child.stderr.close()
+
+
+def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
+    import threading
+
+    class Tty(io.StringIO):
+        def isatty(self):
+            return True
+
+    out = Tty()
+    monkeypatch.setattr(sys, "stdout", out)
+    before = signal.getsignal(signal.SIGINT)
+    arguments = ["dashboard", "--interface", "virtual", "--channel", "thread", "--duration", "1.2"]
+    thread = threading.Thread(target=cli.main, args=(arguments,))
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert "\x1b" not in out.getvalue()
+    assert json.loads(out.getvalue().splitlines()[0])["alerts"] == ["silent"]
+    assert signal.getsignal(signal.SIGINT) is before

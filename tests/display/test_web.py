@@ -1,0 +1,327 @@
+"""The dashboard's server, by a real HTTP client."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import urlopen
+
+import pytest
+
+from gz_onboard import cli
+from gz_onboard.display import server as web_server
+from gz_onboard.display.server import MAX_THREADS, Feed, served
+from gz_onboard.errors import InputError
+from gz_onboard.events import Estimate
+from gz_onboard.options import host_and_port
+from tests.display.served import Sender, dashboard
+from tests.display.test_picture import HEALTHY
+from tests.support import HEARS_CTRL_C, ROOT
+
+LONG = 60.0  # s: no wait is as long, on whatever machine
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    end = time.monotonic() + LONG
+    while not (found := condition()):
+        assert time.monotonic() < end, f"not within {LONG:g} s: {what}"
+        time.sleep(0.05)
+    return found
+
+
+def latest(address: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(urlopen(f"{address}api/latest", timeout=LONG).read())
+    return found
+
+
+def asked(address: str, path: str, method: str = "GET", **headers: str) -> tuple[http.client.HTTPResponse, bytes]:
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=LONG)
+    connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer, body
+
+
+@contextmanager
+def stream(address: str) -> Iterator[Iterator[dict[str, Any]]]:
+    """The pictures of /api/stream as they come."""
+    answer = urlopen(f"{address}api/stream", timeout=LONG)
+
+    def pictures() -> Iterator[dict[str, Any]]:
+        event = ""
+        for line in answer:
+            name, _, value = line.decode().strip().partition(": ")
+            if name == "event":
+                event = value
+            elif name == "data" and not event:
+                yield json.loads(value)
+            elif not name:
+                event = ""
+
+    with answer:
+        yield pictures()
+
+
+@pytest.fixture
+def feed() -> Feed:
+    made = Feed()
+    made.publish(b'{"channel":"x"}')
+    return made
+
+
+# --- what it says ---------------------------------------------------------------------------------------------------
+
+
+def test_the_page_and_all_that_it_names():
+    with served(Feed(), "127.0.0.1:0") as address:
+        answer, page = asked(address, "/?theme=night")
+        assert answer.status == 200
+        names = re.findall(r'(?:href|src)="([^"]+)"', page.decode())
+        for name in names:
+            answer, script = asked(address, f"/{name}")
+            assert answer.status == 200, name
+            assert answer.getheader("Cache-Control") == "no-store"
+            names += re.findall(rb'from "\./([\w.]+)"', script) and [
+                n.decode() for n in re.findall(rb'from "\./([\w.]+)"', script) if n.decode() not in names
+            ]
+    assert {"page.js", "draw.js", "de.js", "page.css", "icon.svg"} <= set(names)
+    assert not [name for name in names if "//" in name]  # nothing from elsewhere
+
+
+def test_latest_is_what_the_frames_say():
+    with dashboard("latest") as address:
+        assert latest(address)["heard"] is False
+        with Sender("latest", HEALTHY):
+            found = wait_for(lambda: (p := latest(address))["range"]["km"] and p, "a range")
+    assert found["range"] == {"km": 34.21, "p10_km": 26.54, "p90_km": 44.34}
+    assert found["alerts"] == []
+
+
+def test_the_stream_follows_the_frames():
+    with dashboard("stream") as address, stream(address) as pictures, Sender("stream", HEALTHY) as sender:
+        assert next(p for p in pictures if p["range"]["km"])["range"]["km"] == 34.21
+        sender.estimate = replace(HEALTHY, range=33_000.0, reasons=HEALTHY.reasons)
+        assert next(p for p in pictures if p["range"]["km"] != 34.21)["range"]["km"] == 33.0
+
+
+def test_a_silent_bus_is_told_though_nothing_comes():
+    with dashboard("silent") as address, stream(address) as pictures:
+        with Sender("silent", HEALTHY):
+            next(p for p in pictures if p["range"]["km"] and p["battery"]["soc_percent"])
+        sent = time.monotonic()
+        gone = next(p for p in pictures if p["battery"]["soc_percent"] is None)
+        assert gone["range"]["km"] == 34.21  # its time-out is ten times as long
+        assert time.monotonic() - sent > 0.5
+        silent = next(p for p in pictures if "silent" in p["alerts"])
+        assert silent["range"] == {"km": None, "p10_km": None, "p90_km": None}
+        with Sender("silent", replace(HEALTHY, range=30_000.0)):  # a daemon that was started anew
+            back = next(p for p in pictures if p["range"]["km"])
+        assert back["range"]["km"] == 30.0
+
+
+def test_a_picture_comes_though_nothing_changes():
+    with dashboard("beat") as address, stream(address) as pictures:
+        ages = [next(pictures)["age_s"] for _ in range(4)]
+    assert ages == [None] * 4
+
+
+def test_a_loop_that_hangs_gives_no_old_picture(monkeypatch, feed):
+    with served(feed, "127.0.0.1:0") as address:
+        assert latest(address) == {"channel": "x"}
+        monkeypatch.setattr(web_server, "OLDEST_S", -1.0)
+        answer, text = asked(address, "/api/latest")
+        assert (answer.status, text) == (503, b"There is no current picture.\n")
+        assert feed.after(0, 0.0)[1] == b""  # a stream that begins now waits for the next
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "status"),
+    [
+        ("/nonesuch", "GET", 404),
+        ("/../server.py", "GET", 404),
+        ("/static/page.js", "GET", 404),
+        ("/api/", "GET", 404),
+        ("/", "POST", 501),
+        ("/api/latest", "DELETE", 501),
+    ],
+)
+def test_what_else_is_asked(path, method, status, feed):
+    with served(feed, "127.0.0.1:0") as address:
+        answer, _ = asked(address, path, method)
+        assert answer.status == status
+        assert "default-src 'none'" in (answer.getheader("Content-Security-Policy") or "") or status == 501
+        assert latest(address) == {"channel": "x"}  # it goes on
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost:8000", 200),
+        ("LOCALHOST:8000", 200),
+        ("localhost.", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:80", 200),
+        ("evil.example", 421),
+        ("evil.example:8000", 421),
+        ("localhost..", 421),
+        ("", 421),
+    ],
+)
+def test_a_local_server_has_only_local_names(host, status, feed):
+    with served(feed, "127.0.0.1:0") as address:
+        assert asked(address, "/api/latest", Host=host)[0].status == status
+
+
+def test_nonsense_on_the_port_does_not_end_it(feed):
+    with served(feed, "127.0.0.1:0") as address:
+        place = urlsplit(address)
+        for nonsense in b"\0\xff\r\n\r\n", b"GET", b"GET / HTTP/9.9\r\n\r\n", b"A" * 70_000, b"":
+            with socket.create_connection((place.hostname, place.port or 0), timeout=LONG) as raw:
+                raw.sendall(nonsense)
+        assert latest(address) == {"channel": "x"}
+
+
+def test_too_many_connections_are_turned_away_and_room_is_made_again(feed):
+    with served(feed, "127.0.0.1:0") as address:
+        held = [urlopen(f"{address}api/stream", timeout=LONG) for _ in range(MAX_THREADS - threading.active_count())]
+        with pytest.raises(ConnectionError):
+            asked(address, "/api/latest")
+        for one in held:
+            one.close()
+
+        def room() -> bool:
+            feed.publish(b'{"channel":"x"}')  # a stream that has gone is noticed when something is sent
+            with suppress(ConnectionError):
+                return asked(address, "/api/latest")[0].status == 200
+            return False
+
+        wait_for(room, "room for another")
+
+
+def test_a_browser_that_takes_nothing_is_left(feed, monkeypatch):
+    monkeypatch.setattr(web_server.Handler, "timeout", 0.2)
+    with served(feed, "127.0.0.1:0") as address:
+        place = urlsplit(address)
+        with socket.socket() as idle:
+            idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            idle.connect((place.hostname, place.port or 0))
+            idle.sendall(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
+
+            def served_now() -> bool:
+                feed.publish(b"x" * 100_000)
+                return any("process_request" in thread.name for thread in threading.enumerate())
+
+            wait_for(served_now, "the thread of the stream")
+            wait_for(lambda: not served_now(), "its end")
+
+
+# --- where it listens -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("listen", ["", "8000", ":8000", "127.0.0.1", "127.0.0.1:", "127.0.0.1:x", "::1:80", "h:70000"])
+def test_where_to_listen_must_be_an_address_and_a_port(listen):
+    with pytest.raises(InputError, match="must be ADDRESS:PORT"):
+        host_and_port(listen)
+
+
+def test_an_address_that_is_not_ours():
+    with pytest.raises(InputError, match=r"--listen 192\.0\.2\.1:8000: "), served(Feed(), "192.0.2.1:8000"):
+        pass
+
+
+def test_a_port_that_something_else_has():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(InputError, match=f"{taken}: the port is taken; give another one"), served(Feed(), taken):
+            pass
+
+
+def test_two_dashboards_of_one_bus():
+    with dashboard("two") as one, dashboard("two") as other, Sender("two", HEALTHY):
+        wait_for(lambda: all(latest(address)["range"]["km"] == 34.21 for address in (one, other)), "both")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--once", "--web"], "--once and --web"),
+        (["--listen", "127.0.0.1:0"], "only with --web"),
+        (["--web", "--listen", "nowhere"], "must be ADDRESS:PORT"),
+    ],
+)
+def test_wrong_use_is_told(arguments, told, capsys):
+    assert cli.main(["dashboard", "--interface", "virtual", *arguments]) == 2
+    assert told in capsys.readouterr().err
+
+
+# --- the command as a process of its own ----------------------------------------------------------------------------
+
+
+def started(*arguments: str) -> subprocess.Popen[str]:
+    command = ["-m", "gz_onboard", "dashboard", "--web", "--listen", "127.0.0.1:0", *arguments]
+    return subprocess.Popen(
+        [*HEARS_CTRL_C, sys.executable, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_says_where_it_is_and_ends_in_order(number):
+    with started("--interface", "virtual", "--channel", "alone") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        told = re.fullmatch(
+            r"dashboard: (http://127\.0\.0\.1:\d+/) shows alone \(virtual\)\n", process.stdout.readline()
+        )
+        assert told
+        with stream(told[1]) as pictures:
+            assert next(pictures)["alerts"] == ["silent"]
+            process.send_signal(number)
+            assert process.wait(LONG) == 0
+            assert list(pictures)[3:] == []  # the stream ends with it
+        assert process.stderr.read() == ""
+
+
+def test_a_bus_that_is_not_there_is_told(tmp_path):
+    """SocketCAN without such an interface, or without SocketCAN at all."""
+    with started("--channel", "nonesuch0", "--duration", "20") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        told = re.search(r"http:\S+", process.stdout.readline())
+        if told is None:
+            assert "this kernel has no CAN sockets" in process.stderr.read()
+            assert process.wait(LONG) == 2
+            return
+        assert latest(told[0])["alerts"] == ["bus_down", "silent"]
+        process.terminate()
+        assert process.wait(LONG) == 0
+
+
+def test_it_is_light():
+    code = "import sys, gz_onboard.display.server; print(*{m.partition('.')[0] for m in sys.modules})"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"numpy", "scipy", "matplotlib", "pandas", "asammdf", "pyarrow"} & set(loaded)
+
+
+def test_an_estimate_that_cannot_be_told_has_no_numbers():
+    with dashboard("starting") as address, Sender("starting", Estimate(time=0.0)):
+        found = wait_for(lambda: (p := latest(address))["state"] and p, "a state")
+    assert found["state"] == "starting"
+    assert found["range"]["km"] is None
