@@ -52,22 +52,22 @@ deb-clean-root: setup  ## the package's life on a minimal Debian in a guest, fro
 .venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
 	@.ci/setup docs
 
-bench: setup  ## cost per frame, start-up, memory, next to the plain pipeline; rewrites docs/benchmarks.md (AGAINST=commit)
-	$(PYTHON_IN_VENV) -m benchmarks.bench --page docs/benchmarks.md $(if $(AGAINST),--against $(AGAINST))
+bench: setup  ## cost per frame, start-up, memory, next to the plain pipeline; rewrites docs/results/benchmarks.md (AGAINST=commit)
+	$(PYTHON_IN_VENV) -m benchmarks.bench --page docs/results/benchmarks.md $(if $(AGAINST),--against $(AGAINST))
 
-trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
+trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/results/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)
 
-range-benchmark: setup  ## how good is the range on full discharges of scooters that are not the model's? rewrites docs/range-benchmark.md
+range-benchmark: setup  ## how good is the range on full discharges of scooters that are not the model's? rewrites docs/results/range-benchmark.md
 	$(PYTHON_IN_VENV) -m benchmarks.range_benchmark
 
-validation: setup  ## the recorded rides of the repository against their simulation; rewrites docs/validation.md
-	$(PYTHON_IN_VENV) -m gz_onboard validate $(VALIDATED) --output build/validation --markdown docs/validation.md
+validation: setup  ## the recorded rides of the repository against their simulation; rewrites docs/results/validation.md
+	$(PYTHON_IN_VENV) -m gz_onboard validate $(VALIDATED) --output build/validation --markdown docs/results/validation.md
 	cp build/validation/oval_2C.validation.png docs/images/validation_oval.png
 	$(PYTHON_IN_VENV) -m gz_onboard vehicle maps reference $(MAPPED) --output build/validation
 	cp build/validation/reference-scooter.maps.png docs/images/efficiency_maps.png
 
-hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/reliability.md
+hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/results/reliability.md
 	$(PYTHON_IN_VENV) -m tests.hardening
 
 clean:  ## remove what the other targets made, except runs/

@@ -1,4 +1,4 @@
-"""What gz-onboard costs, beside the obvious pipeline of the same libraries (plain.py). See docs/benchmarks.md.
+"""What gz-onboard costs, beside the obvious pipeline of the same libraries (plain.py). See docs/results/benchmarks.md.
 
 All times are CPU time of the measured process alone, user and system together, read from its own CPU clock; medians
 over windows or repeats. On a kernel with CAN the frames go over a vcan, elsewhere over stand_in.py's sockets.
@@ -412,7 +412,7 @@ class Table:
         print(f"{what:52} {unit:8} {' '.join(cells)}  {aim}", flush=True)
 
     def markdown(self) -> list[str]:
-        """The table of docs/benchmarks.md."""
+        """The table of docs/results/benchmarks.md."""
         head = ["", "unit", "ours", "plain", "plain / ours", *([f"at {self.against}"] if self.against else []), "aim"]
         lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
         for row in self.rows:
@@ -471,14 +471,14 @@ def measure(table: Table, seconds: float, repeats: int, older: Path | None) -> N
 
 
 def main() -> None:
-    """Measure all, print a table and write it into docs/benchmarks.md."""
+    """Measure all, print a table and write it into docs/results/benchmarks.md."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
     parser.add_argument("--seconds", type=float, default=63.0, help="of the longest live run (%(default)g)")
     parser.add_argument("--repeats", type=int, default=3, help="of each measurement (%(default)s)")
     parser.add_argument("--against", metavar="COMMIT", help="measure an older commit in the same run, too")
     parser.add_argument(
-        "--page", type=Path, metavar="FILE", help="write the table into this page, such as docs/benchmarks.md"
+        "--page", type=Path, metavar="FILE", help="write the table into this page, such as docs/results/benchmarks.md"
     )
     arguments = parser.parse_args()
     os.environ["PYTHONPATH"] = f"{ROOT}{os.pathsep}{HERE}"  # this checkout, whatever is installed

@@ -1,9 +1,9 @@
 """Real trips of an electric car through the estimator: state of charge, consumption, range on the way.
 
-    python -m benchmarks.car_trips FOLDER [--write docs/real-car.md]
+    python -m benchmarks.car_trips FOLDER [--write docs/results/real-car.md]
 
-FOLDER holds the tables TripA01_2hz.csv.gz and so on that docs/real-car.md describes. Trips of odd number made the
-vehicle file; those of even number are held out.
+FOLDER holds the tables TripA01_2hz.csv.gz and so on that docs/results/real-car.md describes. Trips of odd number made
+the vehicle file; those of even number are held out.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def main() -> None:
     files = sorted(arguments.folder.glob(PATTERN))
     if not files:
         raise SystemExit(
-            f"car_trips: {arguments.folder}: no {PATTERN} there; docs/real-car.md says where they are from"
+            f"car_trips: {arguments.folder}: no {PATTERN} there; docs/results/real-car.md says where they are from"
         )
     with ProcessPoolExecutor(2) as pool:
         lines = report(list(pool.map(partial(judge, vehicle_file=arguments.vehicle), files)))

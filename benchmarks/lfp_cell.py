@@ -1,6 +1,6 @@
 """State of charge of a cell with a flat curve and hysteresis: an A123 26650 (LFP), -15 to 45 degC.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.lfp_cell DATA_FOLDER [--write docs/lfp-cell.md]
+    OMP_NUM_THREADS=1 python -m benchmarks.lfp_cell DATA_FOLDER [--write docs/results/lfp-cell.md]
 
 Data: G. Plett, Battery Management Systems, vol. 1 (2015), as CSV of github.com/batterysim/esctoolbox-python. The files
 are brought into the package's tables; then `gz-onboard calibrate all` puts the open-circuit voltage and the capacity at
@@ -81,7 +81,7 @@ def errors(work: tuple[Path, Path, str, float]) -> tuple[Array, Array, Array]:
 
 
 def report(folder: Path) -> list[str]:
-    """The tables of docs/lfp-cell.md, as lines of Markdown."""
+    """The tables of docs/results/lfp-cell.md, as lines of Markdown."""
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         write_slow_test(folder, out)

@@ -42,8 +42,8 @@ from gz_onboard.recording.logs import read_log
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import read_vehicle
 
-PAGE = Path(__file__).parents[1] / "docs" / "range-benchmark.md"
-PICTURE = "images/range-benchmark.png"  # beside the page
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "range-benchmark.md"
+PICTURE = "../images/range-benchmark.png"  # from the page
 FIRST = 1125
 TOGETHER = 15  # rides that are ridden at once, for memory
 LEVELS = tuple(x / 10 for x in range(9, 0, -1))  # SOC, at which estimates are judged
@@ -358,7 +358,7 @@ def picture(judged: Judged, file: Path) -> None:
 
 
 def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: str) -> str:
-    """docs/range-benchmark.md."""
+    """docs/results/range-benchmark.md."""
     lines = ["# Range benchmark", "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
     lines += [
         f"Made by `{command}` on commit {version}. Rows are each ride at each tenth of charge from 90 to 20 %.",

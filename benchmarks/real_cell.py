@@ -1,6 +1,7 @@
 """State of charge of a real cell: the on-board filter on a Panasonic NCR18650PF, -20 to 25 degC.
 
-    OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--only Cycle_1] [--board] [--write docs/real-cell.md]
+    OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--only Cycle_1] [--board]
+        [--write docs/results/real-cell.md]
 
 Data: Kollmeyer, "Panasonic 18650PF Li-ion Battery Data", Mendeley Data 2018, doi:10.17632/wykht8y7tg.1, as Parquet and
 1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.calibrate`; the
@@ -346,7 +347,7 @@ def percent(value: float | np.floating[Any], digits: int = 2) -> str:
 
 
 def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
-    """The tables of docs/real-cell.md, as lines of Markdown.
+    """The tables of docs/results/real-cell.md, as lines of Markdown.
 
     only: of cycles whose name holds this; board: of the filter on board alone.
     """

@@ -1,4 +1,4 @@
-"""Every recorded ride through the simulation, open loop and predictive: the tables of docs/recorded-rides.md.
+"""Every recorded ride through the simulation, open loop and predictive: the tables of docs/results/recorded-rides.md.
 
     python benchmarks/recorded_rides.py DATA/rides [--only full_00 ...] [--chassis leaning] [--figures DIR]
 

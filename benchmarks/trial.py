@@ -2,11 +2,11 @@
 
 Draws cases by seed from `tests.plant` (rides of a richer plant, own code and sensors), calibrates a baseline on each
 scooter's healthy rides, lets the tool judge the service rides and counts. What counts as right is defined here and in
-`tests/plant/cases.py`, in terms of the truth alone. Writes docs/trial.md as measured.
+`tests/plant/cases.py`, in terms of the truth alone. Writes docs/results/trial.md as measured.
 
 With ``--healthy N`` the other half: sets of five rides of scooters that stay healthy, drawn with wider spreads of
 riders, charge, temperature and roads than their baselines, judged against the baseline and against the file alone.
-Writes its section of docs/trial.md.
+Writes its section of docs/results/trial.md.
 
 Seeds 0 to 9999 are for development, 100000 to 100119 were a first trial, after which the tool was still changed;
 100120 and up are for the trial, 200000 and up for the small one in the tests.
@@ -142,7 +142,7 @@ def alarm(row: Row) -> bool:
 
 
 def healthy_document(rows: Sequence[Row], first: int, commit: str) -> str:
-    """The section of docs/trial.md on healthy scooters."""
+    """The section of docs/results/trial.md on healthy scooters."""
     sets = sorted({row["seed"] for row in rows})
     lines = [
         MARK,
@@ -172,7 +172,7 @@ def healthy_document(rows: Sequence[Row], first: int, commit: str) -> str:
 
 
 def with_section(text: str, section: str) -> str:
-    """docs/trial.md with its section on healthy scooters replaced, or put before the first other one."""
+    """docs/results/trial.md with its section on healthy scooters replaced, or put before the first other one."""
     head, found, rest = text.partition(MARK)
     if found:
         return head + section + ("\n## " + rest.partition("\n## ")[2] if "\n## " in rest else "")
@@ -352,7 +352,7 @@ def by_strength(rows: Sequence[Row]) -> list[str]:
 
 
 def document(rows: Sequence[Row], first: int, commit: str, took: float) -> str:
-    """docs/trial.md."""
+    """docs/results/trial.md."""
     thresholds = ", ".join(f"{name} {value:g}" for name, value in CHANNEL_CLEAR.items())
     kinds = ", ".join(f"{sum(r['kind'] == kind for r in rows)} {kind}" for kind in plant.cases.KINDS)
     simulated = sum(row["simulated_s"] for row in rows if "simulated_s" in row)
@@ -418,7 +418,7 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, metavar="N", help="false alarms on so many healthy sets instead")
     parser.add_argument("--first", type=int, help=f"first seed ({FIRST}, {HEALTHY_FIRST}; 0 to 9999: development)")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "trial.md")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "results" / "trial.md")
     parser.add_argument("--keep", type=Path, help="keep the plant's rides in this folder (80 MB a case)")
     parser.add_argument("--rows", type=Path, help="write what was said of each case as JSON, too")
     arguments = parser.parse_args()

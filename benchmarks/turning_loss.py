@@ -1,4 +1,4 @@
-"""The pictures of docs/turning-loss.md: what the scooter's model lacks in bends, and what it is worth.
+"""The pictures of docs/how-to/find-losses.md: what the scooter's model lacks in bends, and what it is worth.
 
 python -m benchmarks.turning_loss --output docs/images
 """

@@ -1,4 +1,4 @@
-"""What is too long for ``--help``: calibrate's data and the keys of each JSON result, at the end of docs/commands.md.
+"""Write calibrate's data and the keys of each JSON result at the end of docs/reference/commands.md.
 
 python docs/reference.py    # writes them anew
 """
@@ -23,7 +23,7 @@ from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation import summary as simulated
 from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked
 
-PAGE = Path(__file__).with_name("commands.md")
+PAGE = Path(__file__).parent / "reference" / "commands.md"
 MARK = "<!-- made by docs/reference.py from here on -->"
 RESULTS: tuple[tuple[str, int, Mapping[str, str]], ...] = (
     ("estimate: a ride", estimate.SUMMARY_VERSION, estimate.KEYS),

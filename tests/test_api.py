@@ -24,7 +24,7 @@ from tests.test_learned import CAPACITY, saved
 
 __all__ = ["saved"]  # a fixture
 
-PAGE = ROOT / "docs/python.md"
+PAGE = ROOT / "docs/how-to/python.md"
 COASTDOWN = LOGS / "coastdown.blf"
 anyhow: Any = gz  # for what a type checker would refuse
 BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", re.M | re.S)

@@ -93,7 +93,7 @@ def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: py
 
 
 def test_the_page_of_the_commands_has_them() -> None:
-    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     section = text.partition("\n## Folders")[2].partition("\n## ")[0]
     told = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", section, re.M))
     taking = {

@@ -1,4 +1,4 @@
-"""docs/notebook.ipynb runs from its first cell to its last, as Jupyter runs it, and shows what its text says."""
+"""docs/tutorial/notebook.ipynb runs from first cell to last, as in Jupyter, and shows what its text says."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from tests.support import ROOT
 
-NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
+NOTEBOOK = ROOT / "docs" / "tutorial" / "notebook.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 CODE = ["".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"]
 TEXT = "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "markdown")
@@ -79,6 +79,6 @@ def test_nothing_that_was_run_is_committed():
 
 
 def test_its_links_lead_somewhere():
-    links = re.findall(r"\]\(([\w.-]+)(?:#[\w-]+)?\)", TEXT)
+    links = re.findall(r"\]\(([\w./-]+)(?:#[\w-]+)?\)", TEXT)
     assert len(links) > 3
     assert all((NOTEBOOK.parent / link).is_file() for link in links)

@@ -1,4 +1,4 @@
-"""docs/own-effect.md is true: its files work as they stand there, its commands give what it shows."""
+"""docs/how-to/own-effect.md is true: its files work as they stand there, its commands give what it shows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gz_onboard.model.model import Bound
 from gz_onboard.vehicle import OWN, read_vehicle
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "docs" / "own-effect.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "how-to" / "own-effect.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", TEXT, re.M | re.S)
 
 

@@ -1,4 +1,4 @@
-"""docs/turning-loss.md is true: its commands run on the rides of the repository and give what it shows."""
+"""docs/how-to/find-losses.md is true: its commands run on the rides of the repository and give what it shows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from gz_onboard.vehicle import read_vehicle
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "docs" / "turning-loss.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "how-to" / "find-losses.md").read_text(encoding="utf-8")
 NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 

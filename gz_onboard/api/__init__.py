@@ -1,7 +1,7 @@
 """The Python API: ``import gz_onboard as gz``. Each function does what the command of its name does, without printing.
 
 Results are dataclasses; those with a table have ``to_table()`` (a dict of numpy arrays), ``to_arrow()`` and
-``to_pandas()``. A mistake of the user raises `InputError`. Examples: docs/python.md.
+``to_pandas()``. A mistake of the user raises `InputError`. Examples: docs/how-to/python.md.
 """
 
 from gz_onboard.api.calibrations import Calibration, calibrate

@@ -108,7 +108,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ["procedures:"]
         + [f"  {'all':<12} everything that the manifest {manifest.NAME} of a folder names"]
         + [f"  {name:<12} {procedure.what}" for name, procedure in PROCEDURES.items()]
-        + ["", "Tables have the unit in the name of a column: time_s, current_A. The data of each: docs/commands.md."]
+        + [
+            "",
+            "Tables have the unit in the name of a column: time_s, current_A. Data of each: docs/how-to/calibrate.md.",
+        ]
     )
     add = parser.add_argument
     add("what", metavar="WHAT", help="a procedure, or all")

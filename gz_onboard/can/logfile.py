@@ -1,4 +1,4 @@
-"""One log: an MCAP file with the raw frames in blocks and JSON channels for everything else (docs/log-format.md)."""
+"""Write a log: MCAP with raw frames in blocks and JSON channels for the rest (docs/reference/log-format.md)."""
 
 from __future__ import annotations
 

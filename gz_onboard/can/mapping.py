@@ -1,6 +1,6 @@
 """Read the bus part of a vehicle file: which signal of which message plays which role, in which unit.
 
-docs/vehicle-file.md describes the keys.
+docs/reference/vehicle-file.md describes the keys.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Answers to the diagnostic requests of another tester: what a vehicle file says of them, and how frames become them.
 
-Nothing is ever sent. docs/vehicle-file.md describes the ``[[request]]`` tables. ISO 15765-2 describes how an answer is
-spread over frames; it is complete or dropped and counted. There is no clock: a log gives the same as the live bus.
+Nothing is ever sent. docs/reference/vehicle-file.md describes the ``[[request]]`` tables. ISO 15765-2 describes how an
+answer is spread over frames; it is complete or dropped and counted. No clock is read: a log
+gives the same as the live bus.
 """
 
 from __future__ import annotations

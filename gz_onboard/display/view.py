@@ -1,7 +1,7 @@
 """The view model: the range frames on the bus, checked and aged, as one picture for everything that shows them.
 
-A picture is a JSON object. Terminal, page, MQTT and Foxglove show nothing else; docs/dashboard.md describes its keys. A
-number that is stale, not available or never came is None. Units are in the names, as in the range frames.
+A picture is a JSON object. Terminal, page, MQTT and Foxglove show nothing else; docs/how-to/dashboard.md lists its
+keys. A number that is stale, not available or never came is None. Units are in the names, as in the range frames.
 """
 
 from __future__ import annotations

@@ -153,5 +153,5 @@ def ride_text(ride: ValidatedRide) -> str:
     if ride.soc_reference:
         lines.append(f"  state of charge: {soc_text(ride.soc_reference)}")
     if not ride.passed:
-        lines.append("  what each percentage is of, and where the model is known to fail: docs/validation.md")
+        lines.append("  what each percentage is of, and where the model is known to fail: docs/results/validation.md")
     return "\n".join([*lines, *(f"  {text}" for text in ride.missing)])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Why:
-    """A range against another, split among causes (docs/why.md)."""
+    """A range against another, split among causes (docs/explanation/causes.md)."""
 
     time_s: Annotated[float, "since the first frame"]
     reference_km: Annotated[float, "the rated range; of a change, the range before"]

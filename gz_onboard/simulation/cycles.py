@@ -1,6 +1,6 @@
 """Drive cycles: speed over time, those of the regulations built in, others from a CSV file.
 
-Where the built-in speeds come from, and how they compare with other tables, is in docs/cycles.md.
+Where the built-in speeds come from, and how they compare with other tables, is in docs/reference/cycles.md.
 """
 
 from __future__ import annotations

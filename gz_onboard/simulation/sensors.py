@@ -1,7 +1,7 @@
 """Readings of the reference scooter's sensors in a simulated ride: with gain, offset, noise and delay.
 
 `trace` keeps the scooter's states; `SENSORS` gives the sensor of each signal of the scooter's DBC files.
-Figures are those of docs/reference-scooter.md, or guesses where that has none.
+Figures are those of docs/reference/reference-scooter.md, or guesses where that has none.
 """
 
 from __future__ import annotations

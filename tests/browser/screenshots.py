@@ -1,4 +1,4 @@
-"""The pictures of docs/dashboard.md, of frames as a daemon sends them: ``python -m tests.browser.screenshots``."""
+"""Draw docs/images/dashboard-*.png from frames of a daemon: ``python -m tests.browser.screenshots``."""
 
 from __future__ import annotations
 

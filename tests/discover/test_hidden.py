@@ -1,6 +1,6 @@
 """Hidden effects in rides of a scooter that is not the package's model: a small blind trial with fixed seeds.
 
-The large one is `make trial` (docs/trial.md); nothing was tuned on the seeds of either.
+The large one is `make trial` (docs/results/trial.md); nothing was tuned on the seeds of either.
 """
 
 from __future__ import annotations

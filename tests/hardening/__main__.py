@@ -1,4 +1,4 @@
-"""Every kind with its full count, a process each on every processor; rewrites the tables of docs/reliability.md."""
+"""Run every kind with its full count, one process per processor; rewrites docs/results/reliability.md."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from tests.hardening.kinds import kinds
 from tests.hardening.report import Report
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "reliability.md"
 BEGIN, END = "<!-- measured by make hardening: begin -->\n", "<!-- end -->\n"
 
 

@@ -351,7 +351,7 @@ def test_what_fails_is_told_with_its_limit_and_meaning(two):
     failing = sum(any(not channel["passed"] for channel in channels.values()) for channels in forms)
     assert [line.split(":")[0] for line in text if "FAIL:" in line] == ["    FAIL"] * failing
     assert failing >= 1
-    assert any("docs/validation.md" in line for line in text)
+    assert any("docs/results/validation.md" in line for line in text)
 
 
 def test_tables_as_markdown(two):

@@ -93,7 +93,7 @@ def test_what_makes_no_sense_is_refused_by_line_and_key(tmp_path, old, new, word
 @pytest.mark.parametrize("name", [entry.name for entry in fields(Derating)])
 def test_the_reference_and_the_docs_have_it(name):
     assert f"\n{name} = {{" in CONTROLLER
-    text = (OWN.parents[1] / "docs" / "vehicle-file.md").read_text(encoding="utf-8")
+    text = (OWN.parents[1] / "docs" / "reference" / "vehicle-file.md").read_text(encoding="utf-8")
     assert f"`controller.{name}`" in text
 
 

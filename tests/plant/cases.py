@@ -72,8 +72,8 @@ UNKNOWN: dict[str, tuple[float, float]] = {
 }
 
 # When a hidden effect must be found, in terms of the truth alone: it takes or seems to take this share of energy, or
-# its change is at least this in its own channel, which is twice to three times what docs/reference-scooter.md says that
-# the healthy scooter's parameter or model is known to.
+# its change is at least this in its own channel, which is twice to three times what
+# docs/reference/reference-scooter.md says that the healthy scooter's parameter or model is known to.
 ENERGY_CLEAR = 0.05
 CHANNEL_CLEAR = {
     "torque_constant_loss": 0.05,  # ± 1.3 %, and as much again with temperature

@@ -1,4 +1,4 @@
-"""The service that speaks to a broker: what docs/home-assistant.md promises of it."""
+"""The service that speaks to a broker: what docs/how-to/home-assistant.md promises of it."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class SecondOrderPack(FirstOrderPack):
 
 @dataclass
 class MapMotor:
-    """With a measured loss map [W] over current [A] and speed [rad/s]: the one of docs/simulation.md."""
+    """With a measured loss map [W] over current [A] and speed [rad/s]: the one of docs/explanation/simulation.md."""
 
     loss: Mesh
     torque_constant: float

@@ -1,4 +1,4 @@
-"""What docs/simulation.md says: its example runs, its files and tests are there."""
+"""What docs/explanation/simulation.md says: its example runs, its files and tests are there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "explanation" / "simulation.md").read_text(encoding="utf-8")
 ROWS = [line.split("|")[1:-1] for line in TEXT.splitlines() if re.match(r"\| (\d|ch\. 4|brakes|  *\|)", line)]
 EQUATIONS = [row for row in ROWS if len(row) == 4 and ".py`" in row[2]]
 
@@ -27,7 +27,7 @@ def test_the_example_runs():
 def test_each_equation_has_its_file_and_its_test(row):
     for file in re.findall(r"`([^`]+\.py)`", row[2]):
         assert (
-            ROOT / "gz_onboard" / ("" if file.startswith(("physics", "offline")) else "simulation") / file
+            ROOT / "gz_onboard" / ("" if file.startswith(("model", "offline")) else "simulation") / file
         ).is_file()
     places = re.findall(r"`(\S+\.py)`", row[3]) or ["test_equations.py"]
     code = (ROOT / "tests" / "simulation" / places[0]).read_text(encoding="utf-8")
@@ -46,5 +46,5 @@ def test_every_equation_is_there():
 
 
 def test_pictures_are_there():
-    for picture in re.findall(r"\]\((images/\S+)\)", TEXT):
+    for picture in re.findall(r"\]\(\.\./(images/\S+)\)", TEXT):
         assert (ROOT / "docs" / picture).is_file()

@@ -1,4 +1,4 @@
-"""The thesis' equations (Lord 2016), each as it stands in the running scooter; docs/simulation.md has the table."""
+"""Test each equation of the thesis (Lord 2016) in the running scooter; docs/explanation/simulation.md lists them."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ TRIPS = Path(os.environ.get("GZ_ONBOARD_DATA", "")) / "real" / "ev_bmw_i3_trips"
 
 def test_without_the_trips_it_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["car_trips", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"no TripA\*_2hz.csv.gz there; docs/real-car.md says"):
+    with pytest.raises(SystemExit, match=r"no TripA\*_2hz.csv.gz there; docs/results/real-car.md says"):
         main()
 
 

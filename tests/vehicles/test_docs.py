@@ -14,8 +14,8 @@ import pytest
 from gz_onboard.events import ROLES
 
 ROOT = Path(__file__).parents[2]
-GUIDE = (ROOT / "docs" / "another-vehicle.md").read_text(encoding="utf-8")
-REFERENCE = (ROOT / "docs" / "vehicle-file.md").read_text(encoding="utf-8")
+GUIDE = (ROOT / "docs" / "how-to" / "another-vehicle.md").read_text(encoding="utf-8")
+REFERENCE = (ROOT / "docs" / "reference" / "vehicle-file.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", GUIDE, re.M | re.S)
 FILES = [
     *(ROOT / "tests" / "vehicles").glob("*/*.dbc"),

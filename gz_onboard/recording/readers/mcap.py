@@ -1,4 +1,4 @@
-"""Our own logs, see docs/log-format.md.
+"""Our own logs, see docs/reference/log-format.md.
 
 A file is a sequence of records (https://mcap.dev/spec). They are found here rather than by the mcap library, which
 gives nothing of a file whose end is missing when it seeks, and stops at the first bad chunk when it streams.
