@@ -4,7 +4,7 @@
         [--write docs/results/real-cell.md]
 
 Data: Kollmeyer, "Panasonic 18650PF Li-ion Battery Data", Mendeley Data 2018, doi:10.17632/wykht8y7tg.1, as Parquet and
-1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.calibrate`; the
+1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.calibration`; the
 filter is that of the on-board estimator, fed with events once a second; the drive cycles are used for nothing else.
 """
 
@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.calibrate import ocv, pulse
-from gz_onboard.calibrate.cell_circuit import Circuit, voltage
-from gz_onboard.calibrate.result import Found, Result
-from gz_onboard.calibrate.table import Measurements, Named, read_table
+from gz_onboard.calibration import ocv, pulse
+from gz_onboard.calibration.cell_circuit import Circuit, voltage
+from gz_onboard.calibration.result import Found, Result
+from gz_onboard.calibration.table import Measurements, Named, read_table
 from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.estimator.battery_priors import PRIOR
 from gz_onboard.estimator.cells import CellEffects

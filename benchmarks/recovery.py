@@ -1,6 +1,6 @@
 """``python -m benchmarks.recovery``: how often the intervals of cells and cooling networks hold the truth.
 
-The tests' own plants and draws (tests/calibrate), over more seeds than a test has time for: for each parameter the
+The tests' own plants and draws (tests/calibration), over more seeds than a test has time for: for each parameter the
 share within 1.96 of its stated standard deviations (docs/how-to/calibrate.md). The seeds of the tests begin at 0.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.calibrate import test_cooling, test_pulse
-from tests.calibrate.cells import MANY, SLOW
+from tests.calibration import test_cooling, test_pulse
+from tests.calibration.cells import MANY, SLOW
 
 CELLS = {
     "direct, one pair": ("direct", ((0.03, 30.0),)),

@@ -32,8 +32,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from gz_onboard.discover.baseline import baseline
-from gz_onboard.discover.discovery import discover
+from gz_onboard.discovery.baseline import baseline
+from gz_onboard.discovery.discovery import discover
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.schema import to_json

@@ -18,11 +18,11 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
-from gz_onboard.discover.breakdown import before_and_after, binned, edges, pooled
-from gz_onboard.discover.discovery import discover
-from gz_onboard.discover.extension import write_model
-from gz_onboard.discover.result import METRICS, Gain
-from gz_onboard.discover.verdict import Discovery
+from gz_onboard.discovery.breakdown import before_and_after, binned, edges, pooled
+from gz_onboard.discovery.discovery import discover
+from gz_onboard.discovery.extension import write_model
+from gz_onboard.discovery.result import METRICS, Gain
+from gz_onboard.discovery.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from gz_onboard.calibrate import report
-from gz_onboard.calibrate.command import plain_options
-from gz_onboard.calibrate.procedures import PROCEDURES
-from gz_onboard.discover.result import VERSION as DISCOVER_VERSION
-from gz_onboard.discover.result import Report
+from gz_onboard.calibration import report
+from gz_onboard.calibration.command import plain_options
+from gz_onboard.calibration.procedures import PROCEDURES
+from gz_onboard.discovery.result import VERSION as DISCOVER_VERSION
+from gz_onboard.discovery.result import Report
 from gz_onboard.lab import estimate, validate
 from gz_onboard.lab.history.add import AddedRides
 from gz_onboard.lab.history.ride import MEANING

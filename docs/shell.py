@@ -14,7 +14,7 @@ from pathlib import Path
 import shtab
 
 from gz_onboard import __version__
-from gz_onboard.calibrate.procedures import PROCEDURES
+from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.simulation import cycles
 from gz_onboard.vehicle import OWN

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibrate.cooling_run import ride_run
-from gz_onboard.discover.mixed_model import initial
-from gz_onboard.discover.residuals import start_soc
+from gz_onboard.calibration.cooling_run import ride_run
+from gz_onboard.discovery.mixed_model import initial
+from gz_onboard.discovery.residuals import start_soc
 from gz_onboard.events import Group
 from gz_onboard.model.effect import Port
 from gz_onboard.offline.samples import Samples

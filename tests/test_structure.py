@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import gz_onboard
 from gz_onboard.model.effect import BASE_EFFECTS, QUANTITIES
 
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
@@ -28,8 +29,8 @@ LAYERS = [
     ["offline"],
     ["simulation"],
     ["lab", "display"],
-    ["calibrate"],
-    ["discover"],
+    ["calibration"],
+    ["discovery"],
     ["vehicle_check"],
     ["daemon"],
     ["api"],
@@ -38,7 +39,7 @@ LAYERS = [
 ]
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 
-OFFLINE = ("recording", "offline", "simulation", "lab", "calibrate", "discover", "vehicle_check", "api")
+OFFLINE = ("recording", "offline", "simulation", "lab", "calibration", "discovery", "vehicle_check", "api")
 # Lower, and yet nothing that these need know.
 FORBIDDEN = {
     ("estimator", "can"): "events are all that the estimator sees of a bus",
@@ -205,3 +206,8 @@ def later():
     assert {"gz_onboard.lab", "gz_onboard.daemon", "gz_onboard.estimator.signals", "matplotlib", "pandas"} <= found
     assert HEAVY & set(imports(at_import_time(tree.body), Path("can/codec.py"))) == {"scipy"}
     assert "numpy.linalg" in set(imports(at_import_time(tree.body), Path("can/codec.py")))
+
+
+def test_no_part_has_the_name_of_a_function_of_the_api():
+    """Importing ``gz_onboard.discover`` would hide the function ``gz_onboard.discover``."""
+    assert not {part_of(module) for module in MODULES} & set(gz_onboard.__all__)

@@ -15,7 +15,7 @@ from gz_onboard.api.learnings import LearnedState, read_learned
 from gz_onboard.api.reports import Reported, report
 from gz_onboard.api.simulations import SimulatedRide, Swept, simulate, sweep
 from gz_onboard.api.validations import Validated, validate
-from gz_onboard.discover.command import DiscoveryOptions
+from gz_onboard.discovery.command import DiscoveryOptions
 from gz_onboard.errors import InputError
 from gz_onboard.lab.history.add import AddedRides
 from gz_onboard.offline.samples import Samples

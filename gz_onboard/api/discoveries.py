@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import TypeAlias
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, read_ride, read_vehicle, vehicle_of
-from gz_onboard.calibrate.vehicle_file import vehicle_output
-from gz_onboard.discover import command as discovery
-from gz_onboard.discover.baseline import baseline as learn_baseline
-from gz_onboard.discover.baseline_file import write_baseline
-from gz_onboard.discover.command import DiscoveryOptions
-from gz_onboard.discover.mixed_model import MixedModel
-from gz_onboard.discover.page import write_report
-from gz_onboard.discover.result import Report
-from gz_onboard.discover.summary import summary
-from gz_onboard.discover.verdict import Discovery
+from gz_onboard.calibration.vehicle_file import vehicle_output
+from gz_onboard.discovery import command as discovery
+from gz_onboard.discovery.baseline import baseline as learn_baseline
+from gz_onboard.discovery.baseline_file import write_baseline
+from gz_onboard.discovery.command import DiscoveryOptions
+from gz_onboard.discovery.mixed_model import MixedModel
+from gz_onboard.discovery.page import write_report
+from gz_onboard.discovery.result import Report
+from gz_onboard.discovery.summary import summary
+from gz_onboard.discovery.verdict import Discovery
 from gz_onboard.errors import brief, not_an_input, writing
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.samples import Samples, read_samples

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.calibrate.motor import read_bench
-from gz_onboard.calibrate.table import read_table
+from gz_onboard.calibration.motor import read_bench
+from gz_onboard.calibration.table import read_table
 from gz_onboard.errors import InputError
 from gz_onboard.lab.validate_components import losses
 from gz_onboard.model.model import drag_torque

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from gz_onboard.calibrate.report import write_report
-from gz_onboard.calibrate.result import Panel, PlotLine, Result
+from gz_onboard.calibration.report import write_report
+from gz_onboard.calibration.result import Panel, PlotLine, Result
 from gz_onboard.offline.page import drawn, html_table, tiles, write_page
 from gz_onboard.offline.style import new_figure
 

@@ -19,7 +19,7 @@ from gz_onboard.vehicle import read_vehicle
 from tests.can.doctor import complaints
 from tests.support import LOGS, ROOT
 
-LAYOUT = ROOT / "gz_onboard" / "bridges" / "foxglove_layout.json"
+LAYOUT = ROOT / "gz_onboard" / "display" / "foxglove_layout.json"
 SECONDS = 120
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gz_onboard.calibrate.manifest import read_manifest
-from gz_onboard.calibrate.procedures import PROCEDURES
+from gz_onboard.calibration.manifest import read_manifest
+from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.model.battery import Battery

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.calibrate.cell_circuit import Circuit, Reaction, voltage
-from gz_onboard.calibrate.coastdown_run import Coast
-from gz_onboard.calibrate.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures
-from gz_onboard.calibrate.cooling_run import CoolingRun
-from gz_onboard.calibrate.road_load import RoadLoad
-from gz_onboard.discover import residuals
-from gz_onboard.discover.grid import Ride, read_ride
-from gz_onboard.discover.mixed_model import initial
-from gz_onboard.discover.system import summed
+from gz_onboard.calibration.cell_circuit import Circuit, Reaction, voltage
+from gz_onboard.calibration.coastdown_run import Coast
+from gz_onboard.calibration.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures
+from gz_onboard.calibration.cooling_run import CoolingRun
+from gz_onboard.calibration.road_load import RoadLoad
+from gz_onboard.discovery import residuals
+from gz_onboard.discovery.grid import Ride, read_ride
+from gz_onboard.discovery.mixed_model import initial
+from gz_onboard.discovery.system import summed
 from gz_onboard.estimator.cells import Cell
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port

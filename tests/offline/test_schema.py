@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from gz_onboard.discover.result import (
+from gz_onboard.discovery.result import (
     Errors,
     FoundCause,
     Gain,

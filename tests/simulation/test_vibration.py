@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
-from gz_onboard.discover.grid import vibration as of_samples
+from gz_onboard.discovery.grid import vibration as of_samples
 from gz_onboard.lab.validate_components import battery_voltage, road_load
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.model.effect import MOVING, load_effect

@@ -1,0 +1,280 @@
+"""The procedures of ``gz-onboard calibrate``: which data each takes, and how its pure function is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.calibration import (
+    auxiliary,
+    cooling,
+    cooling_run,
+    losses,
+    motor,
+    ocv,
+    offsets,
+    pulse,
+    resistance,
+    wheel,
+)
+from gz_onboard.calibration import coastdown as coasting
+from gz_onboard.calibration.cell_data import cell_test
+from gz_onboard.calibration.coastdown_run import samples as coastdown_samples
+from gz_onboard.calibration.fit import score
+from gz_onboard.calibration.manifest import Option, Slot
+from gz_onboard.calibration.pulse_error import slow_pair
+from gz_onboard.calibration.result import Curve, Found, Result, compared
+from gz_onboard.calibration.table import Measurements
+from gz_onboard.errors import InputError
+from gz_onboard.offline.samples import Samples, ride_name
+from gz_onboard.offline.sensors import true_columns
+from gz_onboard.vehicle import Vehicle
+
+ABOVE_CUTOFF = 0.2  # V: at C/8 or slower a nearly empty cell is that near its open-circuit voltage
+
+
+@dataclass
+class Given:
+    """The data of one step, read, and what is known by then."""
+
+    vehicle: Vehicle  # with the results of earlier steps
+    earlier: list[Result]
+    tables: dict[str, list[Measurements]] = field(default_factory=dict)  # by slot
+    rides: dict[str, list[Samples]] = field(default_factory=dict)
+    options: dict[str, Option] = field(default_factory=dict)
+
+    def number(self, name: str) -> float:
+        """The option `name`, a number."""
+        value = self.options[name]
+        assert isinstance(value, float | int)
+        return float(value)
+
+    def one(self, slot: str) -> Measurements | None:
+        """The one table of a slot that may be left out."""
+        tables = self.tables.get(slot)
+        return tables[0] if tables else None
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """A row of the registry: what it takes and how its pure function is called."""
+
+    what: str
+    slots: Mapping[str, Slot]
+    run: Callable[[Given], Result]
+    options: Mapping[str, Option] = field(default_factory=dict)
+
+
+def _ocv(given: Given) -> Result:
+    result = ocv.calibrate(given.tables["data"][0])
+    cutoff, empty = given.vehicle.parameters["cell_cutoff_voltage"], float(result.curves["battery.ocv"].value[0])
+    if empty > cutoff + ABOVE_CUTOFF:
+        result.refusals.append(
+            f"the discharge ends at an open-circuit voltage of {empty:.2f} V, {empty - cutoff:.2f} V above "
+            f"cell_cutoff_voltage ({cutoff:g} V): what the cell holds in between is not in its capacity"
+        )
+    return result
+
+
+def _motor(given: Given) -> Result:
+    result = Result("motor")
+    if ramp := given.one("emf"):
+        result.add(motor.voltage_constant(ramp))
+    (dyno,) = given.tables["data"]
+    result.add(motor.torque_constant(dyno, given.one("warming"), given.number("largest_current")))
+    return result
+
+
+def _losses(given: Given) -> Result:
+    (dyno,) = given.tables["data"]
+    result = Result("losses")
+    result.add(losses.motor_losses(dyno, given.number("largest_current")))
+    result.add(losses.inverter_losses(dyno, given.number("largest_current")))
+    copper = "motor_copper_temperature_coefficient"
+    if any(refusal.startswith(copper) for refusal in result.refusals):
+        del result.parameters[copper]  # not measured: what the base file says stays
+    return result
+
+
+THESIS_VOLTS = 0.02  # V: what Lord 2016 gives for a cell on a road profile
+
+
+def _pulse(given: Given) -> Result:
+    curve, capacity = _open_circuit(given)
+    loads = [_load(ride) for ride in _true(given, "load")]
+    method = str(given.options["method"])
+    result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None, method=method)
+    cell, squares = pulse.circuit(result), []
+    for table in given.tables.get("held_out", []):
+        test = cell_test(table)
+        model, measured = pulse.follow_profile(cell, test)
+        result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
+        near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
+        result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
+        slow = slow_pair(test.flowed, test.dt, measured - model)
+        result.notes.append(f"{table.file.name}: {slow.words()}")
+        squares.append(float(np.mean((model - measured)[test.drawn < 0.9 * capacity.value] ** 2)))
+        title = f"{table.file.name}, held out"
+        result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)
+    error, held_out = result.parameters["cell_voltage_error"], float(np.sqrt(np.mean(squares or [0.0])))
+    if held_out > error.sd:  # what no fit has seen tells better than what it was made of
+        source = f"{', '.join(table.file.name for table in given.tables['held_out'])}: rms, held out"
+        result.parameters["cell_voltage_error"] = replace(error, sd=held_out, source=source)
+    return result
+
+
+def _open_circuit(given: Given) -> tuple[Curve, Found]:
+    """The open-circuit voltage and capacity: as just calibrated, else the vehicle file's."""
+    for result in reversed(given.earlier):
+        if "battery.ocv" in result.curves and "cell_capacity" in result.parameters:
+            return result.curves["battery.ocv"], result.parameters["cell_capacity"]
+    battery, known = given.vehicle.pack, given.vehicle.parameters.known["cell_capacity"]
+    value = np.array(battery.ocv_curve.y)
+    curve = Curve(
+        {"soc": np.array(battery.ocv_curve.x)}, value, np.full(len(value), battery.ocv_sd), "V", given.vehicle.file.name
+    )
+    return curve, Found(known.value, known.sd, known.unit, known.source)
+
+
+def _true(given: Given, data: str) -> list[Samples]:
+    """The rides without what the vehicle's sensors are known to err by."""
+    parameters = given.vehicle.parameters
+    return [replace(ride, columns=true_columns(ride.columns, parameters)) for ride in given.rides.get(data, [])]
+
+
+def _load(ride: Samples) -> Array:
+    """The pack current of a ride [A], once a second."""
+    if "pack_current" not in ride.columns:
+        raise InputError(f"{ride.name}: has no pack_current, so it is no load for the cell")
+    at, current = ride.columns["pack_current"]
+    seconds = np.arange(np.floor(at[0]), np.floor(at[-1]))
+    return np.asarray(np.interp(seconds + 0.5, at, current))
+
+
+def _resistance(given: Given) -> Result:
+    rides, needed = given.rides["data"], set(offsets.NEEDED.split())
+    result = Result("resistance")
+    if with_inverter := [ride for ride in rides if needed <= ride.columns.keys()]:
+        result.add(resistance.cable_resistance(with_inverter, given.vehicle))
+    else:
+        lacking = sorted(needed.difference(*(ride.columns for ride in rides)))
+        result.refusals.append(
+            f"cable_resistance: needs {', '.join(lacking)}, which no ride has; the value of the file stays"
+        )
+    result.add(resistance.pack_series_resistance(given.rides["data"], given.vehicle, given.tables.get("pulses", [])))
+    return result
+
+
+def _cooling(given: Given) -> Result:
+    """All four networks, of what of them the data show; what is missing is said."""
+    runs, held = _cooling_runs(given, "data"), _cooling_runs(given, "held_out")
+    result = Result("cooling")
+    networks = {
+        "motor_temperature": cooling.motor_cooling,
+        "inverter_temperature": cooling.inverter_cooling,
+        "cell_temperature": cooling.pack_cooling,
+        "bms_temperature": cooling.bms_cooling,
+    }
+    for sensor, network in networks.items():
+        if any(sensor in run.measured for run in runs):
+            result.add(network(runs, given.vehicle, [run for run in held if sensor in run.measured]))
+        else:
+            result.refusals.append(f"{network.__name__}: no run has {sensor}")
+    if not result.parameters:
+        raise InputError(f"none of the runs has {', '.join(networks)}")
+    return result
+
+
+def _cooling_runs(given: Given, slot: str) -> list[cooling_run.CoolingRun]:
+    """Those with no airflow stated: tables from a closed room, rides and rollers with air as fast as the wheel."""
+    airflow = given.options["airflow"]
+    assert isinstance(airflow, Mapping)
+    of_log = {ride_name(Path(name)): value for name, value in airflow.items()}
+    return [
+        cooling_run.bench_run(table, given.vehicle, airflow.get(table.file.name, "none"))
+        for table in given.tables.get(slot, [])
+    ] + [
+        cooling_run.ride_run(ride, given.vehicle, of_log.get(ride.name, "wheel")) for ride in given.rides.get(slot, [])
+    ]
+
+
+def _coastdown(given: Given) -> Result:
+    runs = given.rides.get("data", []) + [coastdown_samples(table) for table in given.tables.get("data", [])]
+    return coasting.calibrate(runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd"))
+
+
+_LARGEST: dict[str, Option] = {"largest_current": motor.RIDING_CURRENT}
+
+# In the order of `calibrate all`: a procedure may use what those above it have found.
+PROCEDURES: dict[str, Procedure] = {
+    "wheel": Procedure(
+        "rolling radius of the driven wheel from GPS speed over motor speed",
+        {"data": Slot("ride", "rides with GPS", 1)},
+        lambda given: wheel.calibrate(given.rides["data"], given.vehicle),
+    ),
+    "motor": Procedure(
+        "constants of the motor from a dynamometer: back-EMF over speed, torque over current",
+        {
+            "data": Slot("table", "steady points of a motor dynamometer", 1, 1),
+            "emf": Slot("table", "back-EMF over speed at no torque", 0, 1),
+            "warming": Slot("table", "a run at constant current in which the motor warms up", 0, 1),
+        },
+        _motor,
+        _LARGEST,
+    ),
+    "losses": Procedure(
+        "loss of motor and inverter in watts, from a dynamometer with power analyser",
+        {"data": Slot("table", "steady points of a motor dynamometer", 1, 1)},
+        _losses,
+        _LARGEST,
+    ),
+    "ocv": Procedure(
+        "open-circuit voltage and capacity of a cell from a slow discharge and charge",
+        {"data": Slot("table", "a discharge (and charge) of C/8 or slower", 1, 1)},
+        _ocv,
+    ),
+    "pulse": Procedure(
+        "R0, R1, C1 over state of charge and temperature from pulse tests of a cell",
+        {
+            "data": Slot("table", "pulse tests, one for each temperature", 1),
+            "held_out": Slot("table", "a road profile of the cell, to validate", 0),
+            "load": Slot("ride", "rides whose current the cell is to follow", 0),
+        },
+        _pulse,
+        {"method": "reduced"},
+    ),
+    "auxiliary": Procedure(
+        "power of lamps, dashboard and control",
+        {"data": Slot("ride", "rides with auxiliary current, or standing still with pack current", 1)},
+        lambda given: auxiliary.auxiliary_power(_true(given, "data"), given.vehicle),
+    ),
+    "offsets": Procedure(
+        "offset, gain and noise of the pack's sensors",
+        {"data": Slot("ride", "rides that begin or end at rest", 1)},
+        lambda given: offsets.offsets(given.rides["data"], given.vehicle),
+    ),
+    "resistance": Procedure(
+        "resistance of pack and cable beside the cells",
+        {
+            "data": Slot("ride", "rides, above 20 degC for the pack", 1),
+            "pulses": Slot("table", "pulse tests of a cell, at two temperatures or more", 0),
+        },
+        _resistance,
+    ),
+    "cooling": Procedure(
+        "the four cooling networks from warming up and cooling down, on a bench (tables) and on the vehicle (rides)",
+        {"data": Slot("any", "runs of 5 min or longer", 1), "held_out": Slot("any", "further runs, to validate", 0)},
+        _cooling,
+        {"airflow": {}},
+    ),
+    "coastdown": Procedure(
+        "rolling resistance and drag area from coast-downs in both directions",
+        {"data": Slot("any", "coast-downs in both directions: rides, or tables of time and speed", 2)},
+        _coastdown,
+        {"wind_sd": coasting.WIND_SD, "slope_sd": coasting.SLOPE_SD},
+    ),
+}

@@ -1,0 +1,210 @@
+"""The report of a calibration: one self-contained HTML page, and the same as JSON."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.calibration import thesis
+from gz_onboard.calibration.fit import correlation
+from gz_onboard.calibration.result import Curve, Fit, Found, Panel, Result
+from gz_onboard.offline.page import drawn, html_table, write_page
+from gz_onboard.offline.schema import descriptions
+from gz_onboard.offline.style import MUTED, new_figure, rule
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+VERSION = 1
+_COLOURS = ("#1f6feb", "#d1495b", "#2a9d8f", "#e9a03b", "#7b5ea7", "#52606d", "#8c564b", "#17a2b8")
+_MOST_POINTS = 4000  # of a trace: more than a picture shows
+_PICTURE_COLOURS = 16  # of a picture: a panel has few lines
+_MOST_OPEN = 8  # panels of a procedure: more are behind a click
+_MOST_TIED = 12  # parameters: a table of more correlations is not read
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How the errors of parameters are tied: a matrix with ones on its diagonal."""
+
+    parameters: tuple[str, ...]
+    value: Array
+
+
+@dataclass(frozen=True)
+class ProcedureEntry:
+    """What one procedure found, without its pictures."""
+
+    procedure: Annotated[str, "its name"]
+    parameters: Annotated[dict[str, Found], "by name: value, sd, unit, source"]
+    curves: Annotated[dict[str, Curve], "tables of the vehicle file by name: axes, value, sd, unit, source"]
+    correlation: Annotated[list[Correlation], "of parameters found together: parameters, value (a matrix)"]
+    fits: Annotated[list[Fit], "what, unit, rms, largest, r2, points, held_out, data"]
+    refusals: Annotated[list[str], "what the data do not show, and why"]
+    notes: Annotated[list[str], "what else was noticed"]
+
+
+@dataclass(frozen=True)
+class Document:
+    """What ``--json`` writes."""
+
+    vehicle: Annotated[str, "vehicle file that the calibration started from"]
+    out: Annotated[str | None, "vehicle file written, or null"]
+    procedures: Annotated[list[ProcedureEntry], "one for each procedure:"]
+    thesis: Annotated[list[dict[str, str]], "what the thesis gives beside what was found here"]
+
+
+_OF_ALL = descriptions(Document)
+KEYS = {name: _OF_ALL[name] for name in ("vehicle", "out", "thesis", "procedures")}
+KEYS |= {f"  {key}": text for key, text in descriptions(ProcedureEntry).items()}
+
+
+def document(results: Sequence[Result], vehicle: str, out: str | None) -> Document:
+    """The results as ``--json`` writes them."""
+    entries = [
+        ProcedureEntry(r.procedure, r.parameters, r.curves, _correlations(r), r.fits, r.refusals, r.notes)
+        for r in results
+    ]
+    return Document(
+        vehicle, out, entries, [dict(zip(thesis.HEAD, row, strict=True)) for row in thesis.compare(results)]
+    )
+
+
+def _correlations(result: Result) -> list[Correlation]:
+    return [Correlation(names, correlation(np.asarray(matrix))) for names, matrix in result.covariance]
+
+
+# --- text ---------------------------------------------------------------------------------------------------------
+
+
+def plus_minus(value: float, sd: float) -> str:
+    """``value ± sd`` with as many digits as the sd allows."""
+    if not math.isfinite(sd) or sd <= 0:
+        return f"{value:.4g}"
+    digits = max(0, 1 - math.floor(math.log10(sd)))
+    if digits > 6 or abs(value) >= 1e5:
+        return f"{value:.4g} ± {sd:.2g}"
+    return f"{value:.{digits}f} ± {sd:.{digits}f}"
+
+
+def text(result: Result) -> str:
+    """A result in a terminal."""
+    lines = [result.procedure]
+    lines += [f"  {name} = {plus_minus(f.value, f.sd)} {f.unit}" for name, f in result.parameters.items()]
+    lines += [f"  {name}: {shape(c)}" for name, c in result.curves.items()]
+    for f in result.fits:
+        held = ", held out" if f.held_out else ""
+        r2 = f"R² {f.r2:.4f}, " if f.r2 is not None else ""
+        lines.append(f"  fit of {f.what}: {r2}{f.rms:.3g} {f.unit} rms, {f.largest:.3g} at most ({f.data}{held})")
+    lines += [f"  not identified: {refusal}" for refusal in result.refusals]
+    lines += [f"  note: {note}" for note in result.notes]
+    return "\n".join(lines)
+
+
+def shape(curve: Curve) -> str:
+    """What a table is over and where it lies."""
+    over = " and ".join(f"{len(values)} of {axis}" for axis, values in curve.axes.items())
+    return f"{curve.value.min():.4g} to {curve.value.max():.4g} {curve.unit} over {over}"
+
+
+# --- page ---------------------------------------------------------------------------------------------------------
+
+
+def write_report(file: Path, title: str, results: Sequence[Result], trouble: Exception | None = None) -> None:
+    """Write the page: of each procedure its values, fits, refusals and a picture. Raises OSError.
+
+    trouble: why there is no more, or no vehicle file.
+    """
+    names = [html.escape(result.procedure) for result in results]
+    body = ["<nav>" + "".join(f'<a href="#{name}">{name}</a>' for name in names) + "</nav>"]
+    body += [f'<p class="no">Not finished: {html.escape(str(trouble))}</p>'] if trouble else []
+    body += [_section(result) for result in results]
+    if rows := thesis.compare(results):
+        body.append(f"<h2>Comparison with the thesis</h2>{html_table(thesis.HEAD, rows, [1, 2, 3])}")
+    write_page(file, title, body)
+
+
+def _section(result: Result) -> str:
+    parts = [f'<h2 id="{html.escape(result.procedure)}">{html.escape(result.procedure)}</h2>']
+    if result.parameters:
+        rows = [[name, plus_minus(f.value, f.sd), f.unit, f.source] for name, f in result.parameters.items()]
+        parts.append(html_table(["parameter", "value ± sd", "unit", "source"], rows, [1]))
+    if result.curves:
+        rows = [[name, shape(c), c.source] for name, c in result.curves.items()]
+        parts.append(html_table(["table", "values", "source"], rows, [0]))
+    if result.fits:
+        parts.append(
+            html_table(
+                ["fit", "data", "points", "R²", "rms", "largest", "unit"],
+                [fit_row(f) for f in result.fits],
+                [2, 3, 4, 5],
+            )
+        )
+    for tied in _correlations(result):
+        names = tied.parameters
+        rows = [[a, *(f"{tied.value[i, j]:+.2f}" for j in range(i + 1))] for i, a in enumerate(names)]
+        if len(names) <= _MOST_TIED:
+            parts.append(html_table(["correlation", *names], rows, range(1, len(names) + 1)))
+    parts += [f'<p class="no">Not identified by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
+    parts += [f"<p>{html.escape(note)}</p>" for note in result.notes]
+    if result.panels:
+        pictures, shown = "".join(map(picture, result.panels)), " open" if len(result.panels) <= _MOST_OPEN else ""
+        summary = f"<summary>Pictures ({len(result.panels)})</summary>"
+        parts.append(f'<details{shown}>{summary}<div class="panels">{pictures}</div></details>')
+    return "\n".join(parts)
+
+
+def fit_row(fit: Fit) -> list[str]:
+    """A row of the table of fits."""
+    return [
+        fit.what,
+        fit.data + (" (held out)" if fit.held_out else " (fitted)"),
+        str(fit.points),
+        "" if fit.r2 is None else f"{fit.r2:.4f}",
+        f"{fit.rms:.3g}",
+        f"{fit.largest:.3g}",
+        fit.unit,
+    ]
+
+
+def picture(panel: Panel) -> str:
+    """A panel as an HTML figure."""
+    figure = new_figure(6.2, 3.4)
+    figure.set_layout_engine("constrained")
+    _draw(figure.add_subplot(), panel)
+    title = f"<figcaption><b>{html.escape(panel.title)}</b></figcaption>"
+    return f"<figure>{title}{drawn(figure, panel.title, _PICTURE_COLOURS)}</figure>"
+
+
+def _draw(axis: Axes, panel: Panel) -> None:
+    axis.set_xlabel(panel.x_label, fontsize=9, color=MUTED)
+    axis.set_ylabel(panel.y_label, fontsize=9, color=MUTED)
+    rule(axis)
+    labels = 0
+    for i, trace in enumerate(panel.traces):
+        x, y = thinned(trace.x), thinned(trace.y)
+        points = trace.style in (".", ",", "o", "x", "+")
+        axis.plot(
+            x,
+            y,
+            trace.style,
+            color=_COLOURS[i % len(_COLOURS)],
+            label=trace.label or None,
+            markersize=3 if points else 5,
+            linewidth=1.3,
+        )
+        labels += bool(trace.label)
+    if labels:
+        axis.legend(fontsize=7.5, frameon=False, ncols=2 if labels > 5 else 1)
+
+
+def thinned(values: Array) -> Array:
+    """`values`, every n-th of them where there are more than a picture shows."""
+    return values[:: max(1, len(values) // _MOST_POINTS)]

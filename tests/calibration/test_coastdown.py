@@ -1,0 +1,323 @@
+"""Coast-downs: recovery from a plant of its own, what is refused, the project's recorded run, other people's."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gz_onboard.calibration.coastdown import calibrate
+from gz_onboard.calibration.coastdown_run import coast, directions, samples
+from gz_onboard.calibration.road_load import NAMES
+from gz_onboard.calibration.table import Measurements, read_table
+from gz_onboard.cli import main
+from gz_onboard.errors import InputError
+from gz_onboard.model.effect import load_effect
+from gz_onboard.model.model import Model
+from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference")
+LOGS = Path(__file__).parents[2] / "replay_logs"
+DATA = os.environ.get("GZ_ONBOARD_DATA")
+DT = 0.1
+
+
+def plant(seed, trials=1, runs=6, **fixed):
+    """(runs, truth) of each trial: coast-downs of a scooter that is not the package's, drawn by seed.
+
+    Own equations, Euler. Each run has a wind with gusts (Ornstein-Uhlenbeck) that blows across too, its own temperature
+    and a speed sensor with noise and steps; mass, inertia, iron drag and the wheel's radius are drawn about what the
+    vehicle file says of them, by its standard deviations, and so is the weather's pressure.
+    """
+    rng = np.random.default_rng(seed)
+    p, shape = VEHICLE.parameters, (trials, 1)
+    draw = {
+        name: p[name] + p.sd(name) * rng.standard_normal(shape)
+        for name in (
+            "vehicle_mass",
+            "wheel_inertia_front",
+            "wheel_inertia_rear",
+            "motor_iron_linear",
+            "motor_iron_quadratic",
+            "wheel_radius",
+        )
+    }
+    low, high = (0.008, 0.0, 0.4), (0.016, 6e-4, 0.7)
+    truth = {
+        name: np.full(shape, fixed.get(name, rng.uniform(a, b, shape)))
+        for name, a, b in zip(NAMES, low, high, strict=True)
+    }
+    c0, c1, area = (truth[name] for name in NAMES)
+    mass = draw["vehicle_mass"] + 75 + rng.standard_normal(shape)
+    radius = draw["wheel_radius"]
+    inertia = mass + (draw["wheel_inertia_front"] + draw["wheel_inertia_rear"]) / radius**2
+    slope = rng.uniform(-0.005, 0.005, shape)
+    way = np.where(np.arange(runs) % 2, -1, 1)
+    celsius = rng.uniform(8, 28, (trials, runs))
+    weather = 1 + 0.012 * rng.standard_normal(shape)
+    density = weather * 101325 * np.exp(-250 / 8300) / (287.05 * (celsius + 273.15))
+    mean, cross = rng.standard_normal((2, trials, runs))
+    strength, lasting = rng.uniform(0.3, 0.8, (trials, runs)), rng.uniform(2, 12, (trials, runs))
+    v = 13.0 + rng.uniform(0, 0.5, (trials, runs))
+    gust = strength * rng.standard_normal((trials, runs))
+    speed: list[Any] = []
+    while len(speed) < 200 / DT and v.max() > 0.3:
+        speed.append(v)
+        gust = gust - gust / lasting * DT + strength * np.sqrt(2 * DT / lasting) * rng.standard_normal(gust.shape)
+        flow = v + mean + gust
+        air = 0.5 * density * area * flow * np.hypot(flow, 0.3 * cross)
+        drag = (draw["motor_iron_linear"] + draw["motor_iron_quadratic"] * v / radius) / radius
+        v = np.maximum(v - DT / inertia * (air + mass * 9.80665 * (c0 + c1 * v + way * slope) + drag), 0.05)
+    rolled, time = np.array(speed), DT * np.arange(len(speed))
+    result = []
+    for i in range(trials):
+        samples = []
+        for r in range(runs):
+            end = int(np.argmax(rolled[:, i, r] < 0.3)) or len(time)
+            wheel = rolled[:end, i, r] / radius[i, 0] + 0.06 * rng.standard_normal(end)
+            columns: Any = {
+                "motor_speed": (time[:end], np.round(wheel / 0.01) * 0.01),
+                "ambient_temperature": (time[:2], np.full(2, celsius[i, r])),
+                "gps_altitude": (time[:2], np.full(2, 250.0)),
+            }
+            facts: dict[str, object] = {"rider_mass_kg": 75.0, "direction": "up" if way[r] > 0 else "down"}
+            samples.append(Samples(f"run_{r}", columns, facts))
+        result.append((samples, {name: float(values[i, 0]) for name, values in truth.items()}))
+    return result
+
+
+def test_intervals_hold_the_truth():
+    away = []
+    for runs, truth in plant(1, trials=100):
+        found = calibrate(runs, VEHICLE, hold_out=False).parameters
+        away.append([(found[name].value - truth[name]) / found[name].sd for name in NAMES])
+    held = dict(zip(NAMES, np.mean(np.abs(away) < 1.96, axis=0), strict=True))
+    for name in NAMES:
+        assert 0.9 <= held[name] <= 0.99, held
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return plant(7)[0]
+
+
+def test_left_out_pairs_are_followed(healthy):
+    found = calibrate(healthy[0], VEHICLE)
+    own, still = (fit for fit in found.fits if fit.held_out)
+    assert own.largest < still.largest < 2.0  # m/s: the thesis' figure
+    assert own.rms < 0.2
+    assert own.points == still.points > 100
+
+
+def test_covariance_is_that_of_the_values(healthy):
+    found = calibrate(healthy[0], VEHICLE, hold_out=False)
+    ((names, covariance),) = found.covariance
+    assert names == NAMES
+    assert np.allclose(np.sqrt(np.diag(covariance)), [found.parameters[name].sd for name in NAMES])
+    assert (np.linalg.eigvalsh(covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))) > 0).all()
+    assert found.panels[0].title == "Coast-downs"
+
+
+def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
+    every = [calibrate(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
+    refused = [found for found in every if found.parameters["rolling_resistance_speed"].value == 0]
+    assert len(refused) >= 5  # it is given from 2 sd on: by chance of one in forty
+    assert all("indistinguishable from zero" in found.refusals[0] for found in refused)
+    assert all("·10⁻⁵ s/m" in found.refusals[0] for found in refused)
+
+
+def test_a_speed_term_that_shows_is_given():
+    found = calibrate(plant(3, rolling_resistance_speed=1.5e-3)[0][0], VEHICLE, hold_out=False)
+    speed = found.parameters["rolling_resistance_speed"]
+    assert not found.refusals
+    assert abs(speed.value - 1.5e-3) < 2.5 * speed.sd
+
+
+def test_one_direction_leaves_slope_and_rolling_resistance_together(healthy):
+    runs, truth = healthy
+    found = calibrate(runs[::2], VEHICLE, hold_out=False)
+    assert "rolling_resistance_constant" not in found.parameters
+    assert any("all runs go one way (up)" in text and "± 0.01" in text for text in found.refusals)
+    drag = found.parameters["drag_area"]
+    assert abs(drag.value - truth["drag_area"]) < 3 * drag.sd
+
+
+def changed(run, **columns):
+    return replace(run, columns=run.columns | columns)
+
+
+def test_refused_runs(healthy):
+    runs = list(healthy[0])
+    time, speed = runs[0].columns["motor_speed"]
+    with pytest.raises(InputError, match=r"run_0: too short a coast-down: 7\.\d s"):
+        calibrate([changed(runs[0], motor_speed=(time[:80], speed[:80])), *runs[1:]], VEHICLE)
+    rising = speed + 12 * np.exp(-(((time - 40) / 4) ** 2))
+    with pytest.raises(InputError, match="run_0: the speed rises from"):
+        calibrate([changed(runs[0], motor_speed=(time, rising)), *runs[1:]], VEHICLE)
+    driving = np.where((time > 20) & (time < 24), 9.0, -0.3)
+    with pytest.raises(InputError, match=r"run_0: the motor drives while it should coast: 9\.0 A"):
+        calibrate([changed(runs[0], motor_current=(time, driving)), *runs[1:]], VEHICLE)
+    with pytest.raises(InputError, match="at least 2"):
+        calibrate(runs[:1], VEHICLE)
+    with pytest.raises(InputError, match="given twice"):
+        calibrate([runs[0], runs[0]], VEHICLE)
+    columns = {role: values for role, values in runs[0].columns.items() if role != "motor_speed"}
+    with pytest.raises(InputError, match="has no speed"):
+        calibrate([replace(runs[0], columns=columns), runs[1]], VEHICLE)
+    cold = {role: values for role, values in runs[0].columns.items() if role != "ambient_temperature"}
+    with pytest.raises(InputError, match="ambient_C"):
+        calibrate([replace(runs[0], columns=cold), runs[1]], VEHICLE)
+    with pytest.raises(InputError, match="neither noted"):
+        directions([replace(run, facts={}) for run in runs])
+    odd = [replace(run, facts={"direction": word}) for run, word in zip(runs, "abc", strict=False)]
+    with pytest.raises(InputError, match="3 directions"):
+        directions(odd)
+
+
+def test_the_recorded_coastdown():
+    run = read_samples(LOGS / "coastdown.blf", VEHICLE)
+    rolled = coast(run, VEHICLE, 1)
+    assert rolled.speed[0] == pytest.approx(12.4, abs=0.3)
+    assert rolled.speed[-1] < 2.5
+    assert (rolled.slowing > 0).all()
+    assert rolled.temperature == pytest.approx(12.5, abs=0.3)
+
+
+@pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA names no folder of recorded rides")
+def test_commissioning_coastdowns():
+    logs = sorted(Path(DATA or "").rglob("commissioning/coastdown_*.blf"))
+    if not logs:
+        pytest.skip("no coast-downs in GZ_ONBOARD_DATA")
+    found = calibrate([read_samples(log, VEHICLE) for log in logs], VEHICLE)
+    own, still = (fit for fit in found.fits if fit.held_out)
+    assert own.largest < 0.3
+    assert still.largest < 1.2
+    c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
+    assert abs(c0.value - 0.012) < 3 * c0.sd
+    assert 0.4 < area.value < 0.65
+
+
+# --- CSV ----------------------------------------------------------------------------------------------------------
+
+
+NOTES = '[{"name": "down", "direction": "down", "total_mass_kg": 180, "ambient_C": 20}]'
+
+
+def in_table(folder, text, notes=NOTES):
+    (folder / "rides.json").write_text(notes)
+    file = folder / "down.csv"
+    file.write_text(text)
+    return samples(read_table(file))
+
+
+def test_a_table_of_time_and_speed(tmp_path):
+    run = in_table(tmp_path, "time_s,speed_kmh\n0,36\n1,35.1\n2.5,34.2\n")
+    time, speed = run.columns["vehicle_speed"]
+    assert time.tolist() == [0, 1, 2.5]
+    assert speed == pytest.approx([10, 9.75, 9.5])
+    assert (run.name, run.facts) == ("down", {"direction": "down", "total_mass_kg": 180, "ambient_C": 20})
+    warm = in_table(
+        tmp_path,
+        "time_s,motor_speed_rpm,ambient_temperature_degC\n0,300,21\n1,295,21\n",
+        '[{"name": "down", "direction": "down", "rider_mass_kg": 70}]',
+    )
+    assert warm.columns["motor_speed"][1][0] == pytest.approx(31.416, abs=1e-3)
+    assert warm.columns["ambient_temperature"][1].tolist() == [21, 21]
+    assert warm.rider_mass == 70
+
+
+@pytest.mark.parametrize(
+    ("text", "notes", "message"),
+    [
+        ("time_s,sped_kmh\n0,1\n1,2\n", NOTES, r"down.csv: no column for 'speed', in m/s \(did you mean 'sped'\?\)"),
+        ("time_s,speed_rpm\n0,1\n1,2\n", NOTES, r"'speed_rpm': speed cannot be in rpm"),
+        ("time_s,speed_mps\n0,1\n1,fast\n2,3\n", NOTES, "line 3, column 'speed_mps': 'fast' is not a finite number"),
+        ("time_s,speed_mps\n0,9\n1,8\n1,7\n", NOTES, "down.csv:4: time: 1 s does not increase"),
+        ("9\n8\n7\n", NOTES, "down.csv:1: 9 ... are numbers, not names of columns"),
+        ("time_s,speed_mps\n0,9\n1,8,7\n", NOTES, "down.csv:3: 3 values for 2 columns"),
+        ("time_s,speed_mps\n0,9\n1,8\n", "[]", "rides.json beside it says no direction of 'down'"),
+        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("tot", "t"), "'tal_mass_kg' is no .*mean 'total_mass_kg'"),
+        (
+            "time_s,speed_mps\n0,9\n1,8\n",
+            NOTES.replace('"ambient_C": 20', '"kind": "x"'),
+            "says no ambient_C of 'down'",
+        ),
+        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("180", '"180 kg"'), "down: total_mass_kg '180 kg': must be"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(tmp_path, text, notes, message):
+    with pytest.raises(InputError, match=message):
+        in_table(tmp_path, text, notes)
+
+
+def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
+    """By the command: 1 Hz speeds in CSV, facts beside them."""
+    runs, truth = healthy
+    notes = []
+    for run in runs:
+        time, speed = run.columns["motor_speed"]
+        rolling = coast(run, VEHICLE, 1)
+        inside = (time >= rolling.time[0]) & (time <= rolling.time[-1])
+        rows = zip(time[inside], speed[inside] * VEHICLE.parameters["wheel_radius"] * 3.6, strict=True)
+        lines = ["time_s,speed_kmh", *(f"{t:.2f},{v:.4f}" for t, v in rows)]
+        (tmp_path / f"{run.name}.csv").write_text("\n".join(lines) + "\n")
+        notes.append(
+            {
+                "name": run.name,
+                "direction": run.facts["direction"],
+                "ambient_C": rolling.temperature,
+                "rider_mass_kg": rolling.payload,
+            }
+        )
+    (tmp_path / "rides.json").write_text(json.dumps(notes))
+    answer = tmp_path / "answer.json"
+    files = [str(tmp_path / f"{run.name}.csv") for run in runs]
+    assert main(["calibrate", "coastdown", *files, "--json", str(answer)]) == 0
+    (found,) = json.loads(answer.read_text())["procedures"]
+    same = calibrate(runs, VEHICLE, hold_out=False)
+    for name in ("rolling_resistance_constant", "drag_area"):
+        value = found["parameters"][name]["value"]
+        # A table begins at its greatest speed, a ride where the throttle closes.
+        assert value == pytest.approx(same.parameters[name].value, abs=0.7 * same.parameters[name].sd)
+        assert abs(value - truth[name]) < 3 * found["parameters"][name]["sd"]
+
+
+def small_car():
+    """A vehicle without a driven wheel that turns along, of 76 kg in all: wheels of a Shell Eco-marathon car."""
+    small = {
+        "drag_area": 0.064,
+        "rolling_resistance_constant": 0.004,
+        "wheel_inertia_front": 0.02,
+        "wheel_inertia_rear": 0.01,
+    }
+    p = VEHICLE.parameters
+    known = {
+        n: replace(v, value=small.get(n, v.value), sd=0.2 * small[n] if n in small else v.sd)
+        for n, v in p.known.items()
+    }
+    parameters = type(p)(known)
+    effects = tuple(load_effect(n) for n in ("aerodynamic_drag", "rolling_resistance", "grade_force", "inertia"))
+    return replace(VEHICLE, parameters=parameters, model=Model(effects, parameters))
+
+
+@pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA names no folder of recorded rides")
+def test_speeds_alone_give_wide_intervals():
+    """An Eco-marathon car, 1 Hz speeds, no wind, no slope; its builders give a rolling coefficient by own fit."""
+    folder = Path(DATA or "") / "real" / "coastdown_ecomarathon"
+    if not folder.is_dir():
+        pytest.skip("no Eco-marathon coast-downs in GZ_ONBOARD_DATA")
+    runs = []
+    for name in ("A", "A1", "B", "B1"):
+        speed = np.loadtxt(folder / f"Michelin60{name}.csv") / 3.6
+        table = Measurements(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
+        runs.append(samples(table, {"direction": name[0], "total_mass_kg": 76.0, "ambient_C": 30.0}))
+    found = calibrate(runs, small_car(), hold_out=True)
+    c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
+    assert 0.001 < c0.value < 0.008
+    assert area.sd > 0.1 * area.value

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.calibration.fit import as_groups, correlation, every_second, line, linear, nonlinear, score, split
+from gz_onboard.calibration.result import compared
+from gz_onboard.errors import InputError
+
+SEEDS = 400
+
+
+def inside(found, truth):
+    """Whether each parameter lies within its 95 % interval."""
+    return np.array([abs(found[name] - truth[name]) < 1.96 * found.sd(name) for name in found.names])
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=5))
+@settings(max_examples=50, deadline=None)
+def test_linear_finds_what_is_there(seed, truth):
+    columns = {f"p{i}": c for i, c in enumerate(np.random.default_rng(seed).normal(size=(len(truth), 40)))}
+    found = linear(columns, sum(p * c for p, c in zip(truth, columns.values(), strict=True)))
+    assert np.allclose(found.value, truth, rtol=1e-6, atol=1e-6)
+
+
+def test_linear_and_nonlinear_agree():
+    rng = np.random.default_rng(0)
+    x = np.linspace(0, 3, 60)
+    y = 2 + 0.7 * x + rng.normal(0, 0.1, 60)
+    a = linear({"a": np.ones(60), "b": x}, y, 0.1, prior={"b": (0.6, 0.05)})
+    b = nonlinear(lambda p: (p[0] + p[1] * x - y) / 0.1, {"a": 1.0, "b": 1.0}, prior={"b": (0.6, 0.05)}, known_sd=True)
+    assert np.allclose(a.value, b.value, rtol=1e-5)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_intervals_hold_95_percent(known):
+    x = np.linspace(0, 1, 30)
+    truth = {"a": 1.0, "b": -2.0, "c": 0.5}
+    held = np.zeros(3)
+    for seed in range(SEEDS):
+        y = 1 - 2 * x + 0.5 * x**2 + np.random.default_rng(seed).normal(0, 0.2, 30)
+        held += inside(linear({"a": np.ones(30), "b": x, "c": x**2}, y, 0.2 if known else None), truth)
+    assert np.all((held / SEEDS > 0.90) & (held / SEEDS < 0.99))
+
+
+def test_groups_hold_where_the_samples_of_a_run_depend_on_each_other():
+    runs, each = 20, 50
+    labels = np.repeat(np.arange(runs), each)
+    held = {True: 0, False: 0}
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        x = np.repeat(rng.normal(size=runs), each) + 0.1 * rng.normal(size=runs * each)
+        y = 3 * x + np.repeat(rng.normal(size=runs), each) + 0.1 * rng.normal(size=runs * each)
+        for grouped in held:
+            held[grouped] += inside(linear({"k": x}, y, groups=labels if grouped else None), {"k": 3.0})[0]
+    assert held[True] / SEEDS > 0.88  # 20 groups: the sandwich is known to be a little short
+    assert held[False] / SEEDS < 0.5  # what taking all samples as independent would claim
+
+
+def test_a_prior_is_weighed_against_the_data_and_grows_when_they_say_nothing():
+    ones = np.ones(10)
+    found = linear({"a": ones, "b": ones}, 5 * ones, 1.0, prior={"a": (2.0, 0.1)})
+    assert found["a"] == pytest.approx(2) and found["b"] == pytest.approx(3)
+    assert found.sd("a") == pytest.approx(0.1) and found.sd("b") == pytest.approx(np.hypot(0.1, 1 / np.sqrt(10)))
+    assert correlation(found.covariance)[0, 1] < 0
+    with pytest.raises(InputError, match="cannot separate a and b"):
+        linear({"a": ones, "b": ones}, 5 * ones)
+
+
+def test_refusals():
+    with pytest.raises(InputError, match="1 points are too few for 2 parameters"):
+        linear({"a": np.ones(1), "b": np.ones(1)}, np.ones(1))
+    with pytest.raises(InputError, match="b is not identifiable"):
+        linear({"a": np.ones(5), "b": np.zeros(5)}, np.ones(5))
+    with pytest.raises(InputError, match="k is not identifiable"):
+        nonlinear(lambda p: p[:1] - np.ones(4), {"a": 0.0, "k": 1.0})
+
+
+def test_split_holds_out_a_share_and_is_the_same_each_time():
+    keep = split(90)
+    assert keep.sum() == 60 and np.array_equal(keep, split(90)) and not np.array_equal(keep, split(90, seed=1))
+
+
+def test_score():
+    fit = score("x", "W", np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0]), held_out=True, source="here")
+    assert (fit.largest, fit.r2, fit.points) == (1.0, 0.5, 3) and fit.rms == pytest.approx(np.sqrt(1 / 3))
+    assert score("x", "W", np.ones(3), np.ones(3), held_out=True, source="here").r2 is None
+
+
+def test_a_line_of_all_points_and_of_some():
+    x = np.arange(8.0)
+    y = np.where(x < 4, 2 * x + 1, 3 * x)
+    found, whole, part = line("slope", x, y, x < 4)
+    assert found["slope"] == pytest.approx(np.polyfit(x, y, 1)[0])
+    assert whole == pytest.approx(found["slope"] * x + found["offset"])
+    assert part == pytest.approx(2 * x + 1)
+
+
+def test_groups_count_from_three_on_and_every_second_is_fitted():
+    labels = np.array([0, 0, 1, 1, 2])
+    assert as_groups(labels) is labels
+    assert as_groups(labels[:4]) is None
+    assert every_second(labels).tolist() == [True, True, False, False, True]
+    assert every_second(np.zeros(9, dtype=int)).tolist() == split(9).tolist()
+
+
+def test_data_and_model_are_drawn_with_what_is_left_over():
+    x, data, model = np.array([2.0, 1.0]), np.array([5.0, 3.0]), np.array([4.5, 3.5])
+    both, left = compared("Sag", "current [A]", "voltage, mean [V]", x, data, model)
+    assert both.traces[1].x.tolist() == [1.0, 2.0]
+    assert both.traces[1].y.tolist() == [3.5, 4.5]
+    assert (left.title, left.y_label) == ("Sag: residual", "measured less model [V]")
+    assert left.traces[0].y.tolist() == [0.5, -0.5]
+    assert compared("Loss", "x", "y [W]", x, data, model, "x")[0].traces[1].x.tolist() == [2.0, 1.0]

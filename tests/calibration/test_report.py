@@ -1,0 +1,109 @@
+"""The report of a calibration."""
+
+from __future__ import annotations
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from gz_onboard.calibration.report import VERSION, document, picture, plus_minus, text, thinned, write_report
+from gz_onboard.calibration.result import Curve, Fit, Found, Panel, PlotLine, Result
+from gz_onboard.offline.results import write_json
+
+NAN = float("nan")
+
+
+def a_result() -> Result:
+    x = np.linspace(0, 1, 20001)
+    return Result(
+        "coast",
+        {"drag_area": Found(0.5, 0.03, "m²", "runs <1> & 2"), "mass": Found(100, 0.0, "kg", "sheet")},
+        {"battery.r0": Curve({"soc": np.array([0, 1.0])}, np.array([0.1, 0.2]), np.array([NAN, 0.1]), "ohm", "pulse")},
+        [(("drag_area", "mass"), np.array([[4.0, 1.0], [1.0, 1.0]]))],
+        [Fit("speed", "m/s", 0.1, 0.3, 0.99, 12, True, "two runs"), Fit("x", "V", 0.1, 0.3, None, 3, False, "y")],
+        ["the slope: ± 3 %"],
+        ["a note"],
+        [Panel("Speed", "t [s]", "v [m/s]", (PlotLine("measured", x, np.sin(x), "."), PlotLine("model", x, x)))] * 3,
+    )
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to and says."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.words: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.references += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_needs_nothing_else_and_says_all(tmp_path):
+    file = tmp_path / "r.html"
+    write_report(file, "A & B", [a_result()])
+    page = Page()
+    page.feed(file.read_text())
+    assert all(reference.startswith(("#", "data:image")) for reference in page.references)
+    words = " ".join(page.words)
+    for said in ("A & B", "0.500 ± 0.030", "runs <1> & 2", "two runs (held out)", "0.9900", "+0.50", "± 3 %", "a note"):
+        assert said in words
+    assert {"img", "meta"} <= set(page.tags)
+    assert file.stat().st_size < 100_000
+    again = tmp_path / "s.html"
+    write_report(again, "A & B", [a_result()])
+    assert again.read_bytes() == file.read_bytes()
+
+
+def test_json_holds_no_nan(capsys):
+    write_json("-", VERSION, document([a_result()], "v.toml", None))
+    written = capsys.readouterr().out
+    assert "NaN" not in written
+    read = json.loads(written)
+    (procedure,) = read["procedures"]
+    assert read["version"] == 1
+    said = {"value": 0.5, "sd": 0.03, "unit": "m²", "source": "runs <1> & 2", "channel": ""}
+    assert procedure["parameters"]["drag_area"] == said
+    assert procedure["curves"]["battery.r0"]["sd"] == [None, 0.1]
+    assert procedure["correlation"] == [{"parameters": ["drag_area", "mass"], "value": [[1, 0.5], [0.5, 1]]}]
+    assert [fit["held_out"] for fit in procedure["fits"]] == [True, False]
+    assert procedure["refusals"] == ["the slope: ± 3 %"]
+
+
+def test_text():
+    lines = text(a_result()).splitlines()
+    assert lines[0] == "coast"
+    assert "  drag_area = 0.500 ± 0.030 m²" in lines
+    assert "  not identified: the slope: ± 3 %" in lines
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "expected"),
+    [
+        (0.5, 0.03, "0.500 ± 0.030"),
+        (12000, 1500, "12000 ± 1500"),
+        (1e-7, 1e-8, "1e-07 ± 1e-08"),
+        (2, 0, "2"),
+        (2, NAN, "2"),
+    ],
+)
+def test_as_many_digits_as_are_known(value, sd, expected):
+    assert plus_minus(value, sd) == expected
+
+
+def test_thinning_keeps_the_start():
+    values = np.arange(100_000.0)
+    assert thinned(values)[0] == 0
+    assert 4000 <= len(thinned(values)) < 5000
+    assert np.array_equal(thinned(values[:10]), values[:10])
+
+
+def test_a_picture_of_one_panel():
+    assert 1_000 < len(picture(a_result().panels[0])) < 20_000
