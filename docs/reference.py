@@ -14,11 +14,6 @@ from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.discovery.result import VERSION as DISCOVER_VERSION
 from gz_onboard.discovery.result import Report
 from gz_onboard.lab import estimate, validate
-from gz_onboard.lab.history.add import AddedRides
-from gz_onboard.lab.history.ride import MEANING
-from gz_onboard.lab.history.show import Shown
-from gz_onboard.lab.history.text import HISTORY_VERSION
-from gz_onboard.lab.history.totals import LearnedAt, Totals
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation import summary as simulated
 from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked
@@ -32,11 +27,6 @@ RESULTS: tuple[tuple[str, int, Mapping[str, str]], ...] = (
     ("calibrate", report.VERSION, report.KEYS),
     ("discover", DISCOVER_VERSION, descriptions(Report)),
     ("vehicle check: a log", CHECK_VERSION, descriptions(Checked)),
-    ("history add", HISTORY_VERSION, descriptions(AddedRides)),
-    ("history show: a vehicle", HISTORY_VERSION, descriptions(Shown)),
-    ("history show: a month or temperature", HISTORY_VERSION, descriptions(Totals)),
-    ("history show: what was learned", HISTORY_VERSION, descriptions(LearnedAt)),
-    ("history show: a ride", HISTORY_VERSION, MEANING),
 )
 
 

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gz_onboard.api import (
-        AddedRides,
         Baseline,
         Calibration,
         CheckedVehicle,
         Discovered,
         DiscoveryOptions,
         EstimatedRide,
-        History,
         InputError,
         LearnedState,
         LoggedEstimates,
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
         Swept,
         Validated,
         Vehicle,
-        add_to_history,
         baseline,
         calibrate,
         check_vehicle,
@@ -36,7 +33,6 @@ if TYPE_CHECKING:
         estimate,
         read_estimates,
         read_frames,
-        read_history,
         read_learned,
         read_ride,
         read_signals,
@@ -50,14 +46,12 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "AddedRides",
     "Baseline",
     "Calibration",
     "CheckedVehicle",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
-    "History",
     "InputError",
     "LearnedState",
     "LoggedEstimates",
@@ -72,7 +66,6 @@ __all__ = [
     "Validated",
     "Vehicle",
     "__version__",
-    "add_to_history",
     "baseline",
     "calibrate",
     "check_vehicle",
@@ -80,7 +73,6 @@ __all__ = [
     "estimate",
     "read_estimates",
     "read_frames",
-    "read_history",
     "read_learned",
     "read_ride",
     "read_signals",

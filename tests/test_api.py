@@ -348,8 +348,6 @@ def test_what_is_not_of_its_type_is_an_input_error_with_its_name(call, said):
         lambda name: gz.read_vehicle("reference", effects_folder=name),
         gz.read_learned,
         gz.read_estimates,
-        gz.read_history,
-        lambda name: gz.add_to_history([COASTDOWN], name),
         gz.read_signals,
         lambda name: gz.check_vehicle("reference", name),
         gz.discover,

@@ -17,7 +17,6 @@ NO_FOLDER = "cannot be written: there is no folder nowhere; make it"
 READING = {
     "report": ["report", "LOG"],
     "check": ["vehicle", "check", "reference", "LOG"],
-    "history": ["history", "add", "LOG", "--file", "h.sqlite"],
     "export": ["export", "LOG", "out", "--vehicle", "reference"],
     "why": ["plot", "--why", "LOG"],
 }
@@ -28,8 +27,6 @@ WRONG = [
     (["vehicle", "check", "ride.blf", "reference"], "ride.blf: is a log; the vehicle comes first, by name or file"),
     (["vehicle", "check", "reference", "ride.blf", "--quick", "--json", "nowhere/x.json"], NO_FOLDER),
     (["vehicle", "check", "none.toml", "ride.blf"], "gz-onboard vehicle check: none.toml: no such vehicle file"),
-    (["history", "show", "--file", "ride.blf"], "gz-onboard history show: ride.blf: is no history: not an SQLite file"),
-    (["history", "show", "--file", "none.sqlite"], "there is no history yet; `gz-onboard history add LOG` begins one"),
     (["export", "ride.blf", "x.csv", "--estimates"], "of which `gz-onboard estimate ride.blf` makes them"),
     (["export", "ride.blf", "x.mf4", "--signals", "--vehicle", "reference"], "ride.blf: its signals can be written to"),
     (["export", "ride.blf", "x.csv", "--signals", "--vehicle", "reference", "--columns", "x"], " more"),
@@ -95,8 +92,6 @@ def test_what_does_not_fit(arguments, said, capsys):
         ["estimate", "ride.blf", "--output", "NAME"],
         ["estimate", "ride.blf", "--route", "NAME"],
         ["estimate", "ride.blf", "--vehicle", "NAME"],
-        ["history", "add", "ride.blf", "--file", "NAME"],
-        ["history", "show", "--file", "NAME"],
         ["report", "ride.blf", "--output", "NAME"],
         ["vehicle", "check", "NAME", "ride.blf"],
         ["learned", "--state", "NAME"],
@@ -114,8 +109,7 @@ def test_a_name_that_no_file_can_have(arguments, capsys):
     assert "File name too long" in refused(capsys, *(x.replace("NAME", "n" * 300) for x in arguments))
 
 
-@pytest.mark.parametrize("command", ["history", "vehicle"])
-def test_the_parts_of_a_command_are_named(command, capsys):
+def test_the_parts_of_a_command_are_named(capsys):
     with pytest.raises(SystemExit):
-        cli.main([command])
-    assert {"history": "add|show|remove", "vehicle": "new|check|maps"}[command] in capsys.readouterr().err
+        cli.main(["vehicle"])
+    assert "new|check|maps" in capsys.readouterr().err

@@ -57,7 +57,6 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "--chanel", "can0"], "did you mean '--channel'"),
         (["run", "--chanel=can0"], "did you mean '--channel'"),
         (["run", "--chan", "can0"], "did you mean '--channel'"),  # no abbreviations: they break when options are added
-        (["history", "show", "--fromat", "svg"], "unrecognized arguments: --fromat svg\n"),  # only dashes in common
         (["run", "--filter", "filterpi"], "did you mean 'filterpy'"),
         (["run", "--filter", "plt"], "choose from"),
         (["run", "--payload", "much"], "--payload: invalid float value: 'much'"),
@@ -285,7 +284,7 @@ def test_a_wrong_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFix
     assert f"\ngz-onboard {command}: error: unrecognized arguments: --nonsense" in said
 
 
-@pytest.mark.parametrize(("words", "among"), [([], "estimate"), (["vehicle"], "check"), (["history"], "remove")])
+@pytest.mark.parametrize(("words", "among"), [([], "estimate"), (["vehicle"], "check")])
 def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str], words: list[str], among: str):
     with pytest.raises(SystemExit) as ended:
         main(words)

@@ -28,7 +28,6 @@ TAKING = {
     "discover": ["discover", EMPTY],
     "export": ["export", EMPTY, "out"],
     "report": ["report", EMPTY, "-o", "ride.html"],
-    "history": ["history", "add", EMPTY, "--file", "h.sqlite"],
     "plot": ["plot", EMPTY],
     "vehicle": ["vehicle", "check", "reference", EMPTY],
 }

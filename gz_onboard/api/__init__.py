@@ -10,27 +10,23 @@ from gz_onboard.api.discoveries import Baseline, Discovered, baseline, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
 from gz_onboard.api.exports import LoggedFrames, LoggedMessage, LoggedSignals, read_frames, read_signals
 from gz_onboard.api.given import read_ride, read_vehicle
-from gz_onboard.api.histories import History, add_to_history, read_history
 from gz_onboard.api.learnings import LearnedState, read_learned
 from gz_onboard.api.reports import Reported, report
 from gz_onboard.api.simulations import SimulatedRide, Swept, simulate, sweep
 from gz_onboard.api.validations import Validated, validate
 from gz_onboard.discovery.command import DiscoveryOptions
 from gz_onboard.errors import InputError
-from gz_onboard.lab.history.add import AddedRides
 from gz_onboard.offline.samples import Samples
 from gz_onboard.simulation.plan import SimulationOptions
 from gz_onboard.vehicle import Vehicle
 
 __all__ = [
-    "AddedRides",
     "Baseline",
     "Calibration",
     "CheckedVehicle",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
-    "History",
     "InputError",
     "LearnedState",
     "LoggedEstimates",
@@ -44,7 +40,6 @@ __all__ = [
     "Swept",
     "Validated",
     "Vehicle",
-    "add_to_history",
     "baseline",
     "calibrate",
     "check_vehicle",
@@ -52,7 +47,6 @@ __all__ = [
     "estimate",
     "read_estimates",
     "read_frames",
-    "read_history",
     "read_learned",
     "read_ride",
     "read_signals",

@@ -49,11 +49,6 @@ def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys):
     assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride goes on" in said
     assert ride["clock"] == [said.partition("clock  ")[2].partition("\n")[0].strip()]
     assert complaints(tmp_path / "leap.estimate.mcap") == []
-    history = tmp_path / "h.sqlite"
-    assert cli.main(["history", "add", str(log), "--file", str(history), "--quiet"]) == 0
-    out, err = capsys.readouterr()
-    assert "1 ride added" in out
-    assert told in err
     checked = check_log(log, read_vehicle("reference"), quick=True)
     assert checked.duration_s == pytest.approx(SECONDS, abs=1)
     assert f"\n  clock: the log's clock leaps {told}" in check_text(checked)

@@ -26,9 +26,7 @@ def test_the_example_runs():
 @pytest.mark.parametrize("row", EQUATIONS, ids=lambda row: row[0].strip() or row[1].strip())
 def test_each_equation_has_its_file_and_its_test(row):
     for file in re.findall(r"`([^`]+\.py)`", row[2]):
-        assert (
-            ROOT / "gz_onboard" / ("" if file.startswith(("model", "offline")) else "simulation") / file
-        ).is_file()
+        assert (ROOT / "gz_onboard" / ("" if file.startswith(("model", "offline")) else "simulation") / file).is_file()
     places = re.findall(r"`(\S+\.py)`", row[3]) or ["test_equations.py"]
     code = (ROOT / "tests" / "simulation" / places[0]).read_text(encoding="utf-8")
     tests = re.findall(r"`(test_\w+)`", row[3])

@@ -1,1 +1,0 @@
-"""``gz-onboard history``: the rides of months in one SQLite file."""
