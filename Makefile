@@ -71,5 +71,5 @@ hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged state
 	$(PYTHON_IN_VENV) -m tests.hardening
 
 clean:  ## remove what the other targets made, except runs/
-	rm -rf .venv build dist docs/api tests/display/foxglove_npm/node_modules .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf .venv build dist docs/api docs/generated tests/display/foxglove_npm/node_modules .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,7 +1,7 @@
 """``python -m benchmarks.recovery``: how often the intervals of cells and cooling networks hold the truth.
 
 The tests' own plants and draws (tests/calibration), over more seeds than a test has time for: for each parameter the
-share within 1.96 of its stated standard deviations (docs/how-to/calibrate.md). The seeds of the tests begin at 0.
+share within 1.96 of its stated standard deviations (docs/results/calibration.md). The seeds of the tests begin at 0.
 """
 
 from __future__ import annotations

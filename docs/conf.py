@@ -19,7 +19,7 @@ from sphinx.environment import BuildEnvironment
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "gz_onboard"
 API = Path(__file__).parent / "api"
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 project = "gz_onboard"
 author = "The gz_onboard authors"
@@ -43,7 +43,7 @@ ALIASES = {  # what signatures spell out, and how the code says it
 
 
 def write_api_pages() -> None:
-    """A page for each package with all its modules, found anew at each build: none is listed by hand."""
+    """Write a page for each package with all its modules."""
     shutil.rmtree(API, ignore_errors=True)
     API.mkdir()
     pages = []
@@ -126,6 +126,7 @@ def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     import_types()
     write_api_pages()
+    importlib.import_module("reference").write_pages(ROOT / "docs" / "generated")
 
     def document(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
         lines[:] = as_rst(lines)

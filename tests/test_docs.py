@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -104,6 +105,15 @@ def test_commands_are_found():
 def test_commands_have_the_options_that_they_are_shown_with(line):
     arguments = shlex.split(line.partition(": gz-onboard ")[2].replace("...", ""))
     command_line(arguments[:1]).parse_args(arguments)
+
+
+def test_reference_pages_are_made_from_the_code(tmp_path):
+    runpy.run_path(str(ROOT / "docs" / "reference.py"))["write_pages"](tmp_path)
+    pages = {file.stem: file.read_text(encoding="utf-8") for file in tmp_path.iterdir()}
+    assert "\n## discover\n" in pages["commands"]
+    assert "| `energy_wh` |" in pages["commands"]
+    assert "| `drag_area` (required) | m² |" in pages["vehicle"]
+    assert "| `RANGE_RemainingP10` |" in pages["range-frames"]
 
 
 def test_marks_name_the_script_that_made_the_rest():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from gz_onboard import cli
 from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
 from tests.lab.short_logs import short_log
 from tests.recording.test_replay import Listener
-from tests.support import LOGS, ROOT
+from tests.support import LOGS
 
 RIDE = str(LOGS / "coastdown.blf")
 EMPTY, FULL = "EMPTY", "FULL"  # stand for a folder without logs, and one with two
@@ -89,16 +88,6 @@ def test_a_folder_without_logs(arguments: list[str], capsys: pytest.CaptureFixtu
 def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
     assert said in capsys.readouterr().err
-
-
-def test_the_page_of_the_commands_has_them() -> None:
-    text = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
-    section = text.partition("\n## Folders")[2].partition("\n## ")[0]
-    told = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", section, re.M))
-    taking = {
-        name for names, what in told.items() if not what.startswith("error") for name in re.findall(r"`(\w+)", names)
-    }
-    assert taking == {*TAKING, "calibrate"}  # all
 
 
 def test_folders_in_folders_are_logs_and_urls_are_none(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
