@@ -129,14 +129,17 @@ def main() -> None:
 
 
 def soc_table(results: list[tuple[str, list[Sample]]]) -> None:
-    print("| ride | min | SOC, start to end | worst error | worst error over sigma | innovation, mV RMS a cell |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name, s in results:
-        worst = max((x.soc - x.reference for x in s), key=abs)
-        sigmas = max(abs(x.soc - x.reference) / x.soc_sd for x in s)
-        rms = sqrt(sum(x.innovation**2 for x in s) / len(s))
-        ends = f"{100 * s[0].reference:.1f} to {100 * s[-1].reference:.1f} %"
-        print(f"| {name} | {s[-1].time / 60:.0f} | {ends} | {100 * worst:+.2f} % | {sigmas:.2f} | {1000 * rms:.1f} |")
+    """Print a row for each group of rides: folder and kind."""
+    groups: dict[str, list[list[Sample]]] = {}
+    for name, samples in results:
+        groups.setdefault(name.rpartition("_")[0], []).append(samples)
+    print("| rides | number | worst error | worst error over sigma | innovation, mV RMS a cell |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, rides in groups.items():
+        worst = max((x.soc - x.reference for s in rides for x in s), key=abs)
+        sigmas = max(abs(x.soc - x.reference) / x.soc_sd for s in rides for x in s)
+        rms = sorted(1000 * sqrt(sum(x.innovation**2 for x in s) / len(s)) for s in rides)
+        print(f"| {name} | {len(rides)} | {100 * worst:+.2f} % | {sigmas:.2f} | {rms[0]:.1f} to {rms[-1]:.1f} |")
 
 
 def range_table(results: list[tuple[str, list[Sample]]]) -> None:
