@@ -7,7 +7,6 @@ PYTHON_IN_VENV := .venv/bin/python
 VALIDATED := $(addprefix replay_logs/,calibration/ride_000.blf turning/city_11C.mcap city_14C.blf calibration/ride_003.blf \
     calibration/ride_004.blf turning/oval_2C.blf calibration/ride_006.blf calibration/ride_007.blf city_34C.blf \
     validation/dyno_00.blf calibration/dyno_02.blf)
-MAPPED := $(addprefix replay_logs/,calibration/motor_dyno.csv.gz calibration/ride_000.blf city_14C.blf)
 
 .PHONY: help setup run test lint format docs man deb deb-clean-root bench trial range-benchmark validation hardening clean
 .DEFAULT_GOAL := help
@@ -64,8 +63,6 @@ range-benchmark: setup  ## how good is the range on full discharges of scooters 
 validation: setup  ## the recorded rides of the repository against their simulation; rewrites docs/results/validation.md
 	$(PYTHON_IN_VENV) -m gz_onboard validate $(VALIDATED) --output build/validation --markdown docs/results/validation.md
 	cp build/validation/oval_2C.validation.png docs/images/validation_oval.png
-	$(PYTHON_IN_VENV) -m gz_onboard vehicle maps reference $(MAPPED) --output build/validation
-	cp build/validation/reference-scooter.maps.png docs/images/efficiency_maps.png
 
 hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/results/reliability.md
 	$(PYTHON_IN_VENV) -m tests.hardening

@@ -18,12 +18,9 @@ from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.simulation import cycles
 from gz_onboard.vehicle import OWN
-from gz_onboard.vehicle_check.cells import CHEMISTRIES
-from gz_onboard.vehicle_check.kinds import KINDS
 
 ABOUT = "the remaining range of an electric scooter, estimated from its CAN bus"
 
-VALUES = {"KIND": tuple(KINDS), "NAME": tuple(CHEMISTRIES)}  # by metavar, of options of `vehicle new`
 OR_FILE = {  # names in place of which a file may be given, by the function that completes them
     "_gz_onboard_vehicles": tuple(sorted(file.stem for file in OWN.glob("*.toml"))),
     "_gz_onboard_procedures": ("all", *PROCEDURES),
@@ -46,8 +43,6 @@ def completion(shell: str) -> str:
     for action in actions_of(parser):
         if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT", "LOG"):
             action.complete = shtab.FILE  # type: ignore[attr-defined]
-        if {"--kind", "--cells"} & set(action.option_strings):
-            action.choices = VALUES[str(action.metavar)]
         if function := named_by(action):
             action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
     return shtab.complete(parser, shell, preamble={"bash": preamble(BASH), "zsh": preamble(ZSH)})
