@@ -145,28 +145,6 @@ def report(trips: Sequence[Trip]) -> list[str]:
     lines = [f"| | aim | {head} |", "| --- | --- | --- | --- |"]
     for text, aim, figure in FIGURES:
         lines.append(f"| {text} | {aim} | {' | '.join(figure(mine) for mine in groups.values())} |")
-    lines += [
-        "",
-        "| trip | km | Wh/km | state of charge: first error, RMS (points) | that shown: RMS | energy by the model | "
-        "at | remaining distance | by the rule | P10 to P90 over the truth | distrusted |",
-        "| --- " * 11 + "|",
-    ]
-    for t in trips:
-        inside = f"{t.low:.2f} to {t.high:.2f}" + ("" if t.low <= 1 <= t.high else ", **outside**")
-        cells = [
-            t.name,
-            f"{t.km:.1f}",
-            f"{t.wh_per_km:.0f}",
-            f"{100 * t.soc_start:+.1f}, {100 * t.soc_rms:.1f}",
-            f"{100 * t.shown_rms:.1f}",
-            f"{100 * t.modelled:+.0f} %",
-            f"{100 * t.at:.0f} %",
-            f"{100 * t.ours:+.0f} %",
-            f"{100 * t.rule:+.0f} %",
-            inside,
-            ", ".join(t.distrusted) or "none",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 

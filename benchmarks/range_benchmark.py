@@ -29,6 +29,7 @@ from benchmarks.range_rides import Drawn, Truth, again, draw, ride_until_empty, 
 from benchmarks.range_week import NIGHT, RIDES, Ride, ride_weeks
 from benchmarks.range_yardstick import BUT_FOR_HEIGHT, NAMES, OURS, Usual, crps, jumps
 from benchmarks.trial import commit
+from gz_onboard.arrays import Array
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import progress_bar
@@ -49,12 +50,12 @@ SOME_WAY = 0.05  # of the ride, before which jumps do not count
 LEARNED_FROM = 2  # day of a week, from 0, from which something must have been learned
 JOINED = 0.6  # SOC from which a late daemon listens
 TITLES = {
-    "healthy": "Healthy scooters",
-    "journey": "Journeys: towns and fast roads in turn, long climbs",
-    "aged": "Aged packs, first discharge",
-    "second": "Aged packs, second discharge",
-    "punctured": "A tyre loses its air after 40 minutes",
-    "joined": "Joined at 60 % of charge",
+    "healthy": "healthy, one kind of road",
+    "journey": "healthy, journeys with long climbs",
+    "aged": "aged packs, first discharge",
+    "second": "aged packs, second discharge",
+    "punctured": "a tyre loses its air",
+    "joined": "joined at 60 % of charge",
 }
 HEALTHY = "healthy", "journey"  # kinds whose packs and tyres are as their file says
 HALF = 0.5  # SOC from which on it is told, too, how often the interval holds the truth
@@ -270,27 +271,39 @@ def run_weeks(seeds: Sequence[int], jobs: int, *, quiet: bool = False) -> list[D
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def table(judged: Sequence[Judged]) -> list[str]:
-    """Errors of the remaining distance above 20 % of charge, each ride at each tenth of it."""
-    rows = [row for x in judged for row in x.rows if row.level >= JUDGED_FROM]
-    lines = [
-        "| estimator | median | 90 % | bias | held | width, % | CRPS, km | jumps, km |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, words in NAMES.items():
-        error = np.array([100 * (row.ranges[name] / row.true - 1) for row in rows])
-        cells = [f"{x:.1f}" for x in (np.median(np.abs(error)), np.percentile(np.abs(error), 90), np.mean(error))]
-        moved = np.concatenate([x.jumps.get(name, []) for x in judged]) / 1000
-        jumped = f"{np.percentile(moved, 90):.2f}, {moved.max():.1f}" if len(moved) else ""
-        if name in OURS:
-            width = 100 * np.mean([(row.intervals[name].high - row.intervals[name].low) / row.true for row in rows])
-            score = np.mean([crps(row.ranges[name], *row.intervals[name], row.true) for row in rows])
-            held, late = (100 * np.mean([getattr(x, share)[name] for x in judged]) for share in ("held", "held_late"))
-            cells += [f"{held:.0f}, {late:.0f}", f"{width:.0f}", f"{score / 1000:.2f}", jumped]
-        else:  # of a number without an interval its error is the score
-            score = np.mean([abs(row.ranges[name] - row.true) for row in rows])
-            cells += ["", "", f"{score / 1000:.2f}", jumped]
-        lines.append("| " + " | ".join([words, *cells]) + " |")
+def judged_rows(judged: Sequence[Judged]) -> list[Row]:
+    """Each ride at each tenth of charge that counts."""
+    return [row for x in judged for row in x.rows if row.level >= JUDGED_FROM]
+
+
+def error_percent(rows: Sequence[Row], name: str) -> Array:
+    """Errors of the remaining distance [%]."""
+    return np.array([100 * (row.ranges[name] / row.true - 1) for row in rows])
+
+
+def median_table(groups: Mapping[str, Sequence[Judged]]) -> list[str]:
+    """Median error of every estimator, a row for each group of discharges."""
+    lines = ["| discharges | " + " | ".join(NAMES.values()) + " |", "| --- " * (len(NAMES) + 1) + "|"]
+    for title, judged in groups.items():
+        rows = judged_rows(judged)
+        cells = [f"{np.median(np.abs(error_percent(rows, name))):.1f}" for name in NAMES]
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def interval_table(groups: Mapping[str, Sequence[Judged]], name: str) -> list[str]:
+    """Tails, interval, score and jumps of one of our estimators, a row for each group of discharges."""
+    lines = ["| discharges | 90 % | bias | held | width, % | CRPS, km | jumps, km |", "| --- " * 7 + "|"]
+    for title, judged in groups.items():
+        rows = judged_rows(judged)
+        error = error_percent(rows, name)
+        width = 100 * np.mean([(row.intervals[name].high - row.intervals[name].low) / row.true for row in rows])
+        score = np.mean([crps(row.ranges[name], *row.intervals[name], row.true) for row in rows])
+        held, late = (100 * np.mean([getattr(x, share)[name] for x in judged]) for share in ("held", "held_late"))
+        moved = np.concatenate([x.jumps[name] for x in judged]) / 1000
+        cells = [f"{np.percentile(np.abs(error), 90):.1f}", f"{np.mean(error):.1f}", f"{held:.0f}, {late:.0f}"]
+        cells += [f"{width:.0f}", f"{score / 1000:.2f}", f"{np.percentile(moved, 90):.2f}, {moved.max():.1f}"]
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
     return lines
 
 
@@ -337,7 +350,7 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
     lines += [
         f"Made by `{command}` on commit {version}; `--json FILE` writes every ride.",
         "",
-        "- *median*, *90 %*, *bias*: error of the range in %, each ride at each tenth of charge from 90 to 20 %",
+        "- errors of the range in %, at each tenth of charge from 90 to 20 %: median, *90 %* quantile, *bias*",
         "- *held*: share of the way, and of the way from half charge on, on which P10 to P90 contain the truth, %",
         "- *jumps*: change within one km in addition to the distance, 90th percentile and largest",
         "- *all known but the height to come*: the error that no estimator without a route can avoid",
@@ -345,11 +358,12 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
     ]
     if judged:
         lines += [f"![One ride: range shown and distance really left]({PICTURE})", ""]
-    if some := [x for x in judged if x.kind in HEALTHY]:
-        lines += [f"## All {len(some)} discharges of healthy scooters, of every kind of road", "", *table(some), ""]
-    for kind, title in TITLES.items():
-        if some := [x for x in judged if x.kind == kind]:
-            lines += [f"## {title}", "", *table(some), ""]
+    groups = {"all healthy": [x for x in judged if x.kind in HEALTHY]}
+    groups |= {title: [x for x in judged if x.kind == kind] for kind, title in TITLES.items()}
+    groups = {f"{title} ({len(some)})": some for title, some in groups.items() if some}
+    lines += ["## Median error, %", "", *median_table(groups), ""]
+    for name, words in OURS.items():
+        lines += [f"## Interval of {words}", "", *interval_table(groups, name), ""]
     if days:
         lines += ["## Weeks", "", *week_table(days), ""]
     return "\n".join(lines)

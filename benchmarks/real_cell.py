@@ -364,13 +364,11 @@ def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
     with ProcessPoolExecutor(2) as pool:
         keys = [(s.name, c, case) for s, c, case in runs]
         scores = dict(zip(keys, pool.map(jobs, runs, chunksize=4), strict=True))
-    lines = ["## What the calibration found", ""]
-    lines += [f"- {text}" for r in (rest, result) for text in (*r.refusals, *r.notes)]
-    lines += _tables(result)
-    lines += ["", "## State of charge on the drive cycles, filter as on board", "", *_detail(every[0], work, scores)]
-    lines += ["", "Means over the cycles of a temperature, without those of rising temperature:", ""]
+    lines = ["## The cell", *_tables(result)]
+    lines += ["", "## State of charge on the drive cycles, filter as on board", ""]
+    lines += ["Means over the cycles of a temperature, without those of rising temperature:", ""]
     lines += _summary(every[:1], plain, scores, list(CASES))
-    lines += ["", "The filter's own interval of 95 %, and how fast a wrong start is left:", ""]
+    lines += ["", "The filter's 95 % interval, and the time to leave a wrong start:", ""]
     lines += _intervals(every[0], work, scores, random)
     if not board:
         lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
@@ -402,36 +400,10 @@ def _tables(result: Result) -> list[str]:
             f"{c['slow_time'].value[j, k]:.0f} | {1e3 * c['battery.voltage_error'].value[j]:.0f}, "
             f"{c['voltage_error_time'].value[j]:.0f} |"
         )
-    lines += ["", "| fit, in sample | RMS, mV | largest, mV |", "| --- | --- | --- |"]
-    lines += [f"| {f.what} | {1e3 * f.rms:.1f} | {1e3 * f.largest:.0f} |" for f in result.fits if f.unit == "V"]
-    lines += ["", "| mesh | RMS | R² | held out |", "| --- | --- | --- | --- |"]
-    lines += [
-        f"| {f.what} | {f.rms:.3g} {f.unit} | {f.r2 or 0:.4f} | {'yes' if f.held_out else 'no'} |"
-        for f in result.fits
-        if f.what.startswith("mesh")
-    ]
     return lines
 
 
 Scores = dict[tuple[str, Cycle, Case], Score]
-
-
-def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
-    lines = [
-        "| °C | cycle | to SOC, % | right: RMS, max, in 95 % | right, offset | 20 % wrong: RMS, max, in 95 %, s "
-        "| 20 % wrong, offset | σ |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for c in work:
-        cells = []
-        for case in CASES:
-            s = scores[setting.name, c, case]
-            cell = f"{percent(s.rms)}, {percent(s.largest, 1)}, {percent(s.inside, 0)}"
-            cells.append(("never" if np.isnan(s.rms) else cell) + (f", {s.start:.0f}" if s.start > 0 else ""))
-        end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
-        sd = scores[setting.name, c, RIGHT].sd
-        lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
-    return lines
 
 
 def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict[tuple[str, Cycle], Case]) -> list[str]:
@@ -442,7 +414,8 @@ def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict
     groups = {f"{t}": [c for c in work if c.temperature == t and "trise" not in c.name] for t in TEMPERATURES}
     groups["rising"] = [c for c in work if "trise" in c.name]
     for name, group in groups.items():
-        found = {text: [scores[setting.name, c, case] for c in group] for case, text in CASES.items()}
+        plain = {text: case for case, text in CASES.items() if text in DRAWN}  # without an offset
+        found = {text: [scores[setting.name, c, case] for c in group] for text, case in plain.items()}
         found |= {f"{text}, drawn": [scores[setting.name, c, random[text, c]] for c in group] for text in DRAWN}
         for text, mine in found.items() if group else ():
             near = np.array([s.near for s in mine])

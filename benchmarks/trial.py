@@ -301,29 +301,6 @@ def summary(rows: Sequence[Row]) -> dict[str, str]:
     return lines
 
 
-def missed(row: Row) -> bool:
-    """Return whether a case was judged wrongly: a false alarm, or an effect that was not named."""
-    if row["kind"] == "healthy":
-        return bool(row["verdict"] != "none")
-    if row["kind"] == "unknown":
-        return bool(reported(row)) or row["verdict"] != "unknown"
-    return not all(right(row, truth) for truth in row["truths"])
-
-
-def misses(rows: Sequence[Row]) -> list[str]:
-    """A line for each case that was judged wrongly: hidden effects and the answer."""
-    lines = ["| seed | hidden (share of energy; * clear) | verdict | causes | ambiguous |", "|---|---|---|---|---|"]
-    for row in filter(missed, rows):
-        hidden = "; ".join(
-            f"{t['name']} {', '.join(f'{x:+.3g}' for x in t['change'])} ({100 * t['share']:+.1f} %)"
-            + ("*" if t["clear"] else "")
-            for t in row["truths"]
-        )
-        sets = "; ".join(" / ".join(names) for names in row["ambiguous"])
-        lines.append(f"| {row['seed']} | {hidden} | {row['verdict']} | {', '.join(named(row))} | {sets} |")
-    return lines
-
-
 def by_effect(rows: Sequence[Row]) -> list[str]:
     """A line for each effect."""
     lines = [
@@ -388,17 +365,13 @@ def document(rows: Sequence[Row], first: int, commit: str, took: float) -> str:
         "first or in the ambiguous",
         "set. *Reported set*: causes and ambiguous sets. *Oracle*: the same rides with nothing hidden.",
         "",
-        "## By strength",
+        "## By strength (`--rows FILE` writes every case)",
         "",
         *by_strength(rows),
         "",
         "## By effect",
         "",
         *by_effect(rows),
-        "",
-        "## Cases judged wrongly",
-        "",
-        *misses(rows),
         "",
     ]
     return "\n".join(parts)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
 from gz_onboard.errors import InputError
-from gz_onboard.lab.validate import pool, ride_text
+from gz_onboard.lab.validate import ride_text
 from gz_onboard.lab.validate_report import markdown
 from gz_onboard.lab.validate_ride import compare_ride
 from gz_onboard.lab.validate_score import ValidatedRide
@@ -49,7 +49,7 @@ class Validated(Tabular):
 
     def markdown(self) -> str:
         """The tables that ``gz-onboard validate --markdown`` writes."""
-        return markdown(self.rides, pool(self.rides))
+        return markdown(self.rides)
 
 
 @checked

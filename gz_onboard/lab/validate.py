@@ -110,7 +110,7 @@ def _write_tables(arguments: argparse.Namespace, rides: list[ValidatedRide], tog
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
-            write_below(arguments.markdown, MAKER, markdown(rides, together))
+            write_below(arguments.markdown, MAKER, markdown(rides))
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 

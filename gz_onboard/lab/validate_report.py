@@ -58,14 +58,9 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Mapping[s
     write_page(file, f"Validation of {rides[0].vehicle}", parts)
 
 
-def markdown(rides: Sequence[ValidatedRide], together: Mapping[str, Forms]) -> str:
-    """The tables of the page as Markdown; what is beyond its limit in bold."""
-    parts = [f"### {title}\n\n{markdown_table(*table)}" for title, table in _tables(rides)]
-    parts += [
-        f"### Mean error by condition, {where}\n\n{markdown_table(*_failures(forms))}"
-        for where, forms in together.items()
-    ]
-    return "\n\n".join(parts) + "\n"
+def markdown(rides: Sequence[ValidatedRide]) -> str:
+    """Return the summary and the comparison with the thesis as Markdown; values beyond their limit in bold."""
+    return "\n\n".join(f"### {title}\n\n{markdown_table(*table)}" for title, table in _tables(rides)[:2]) + "\n"
 
 
 def _tables(rides: Sequence[ValidatedRide]) -> list[tuple[str, HeadedRows]]:

@@ -272,7 +272,7 @@ def run(count: int, seed: int) -> Report:
     report = Report()
     if any(e.distrusted for e in true):
         report.failures.append("a healthy sensor is accused")
-    always = ended = named = others = 0
+    always = ended = named = slow = others = 0
     for fault in chosen:
         roles, kind, _ = fault
         name = f"{' and '.join(roles)}: {kind}"
@@ -282,7 +282,8 @@ def run(count: int, seed: int) -> Report:
         ended += found.holds_at_end
         named += bool(set(found.named) & set(roles))
         others += bool(set(found.named) - set(roles))
-        if broken or not found.named or max(found.named.values()) > GRACE:  # all others: in the counts below
+        slow += bool(found.named) and max(found.named.values()) > GRACE
+        if broken or not found.named:  # all others: in the counts below
             report.rows[name] = found.told()
         if broken:
             report.failures.append(f"{name}: {'; '.join(broken)}")
@@ -290,5 +291,6 @@ def run(count: int, seed: int) -> Report:
     report.rows["all: interval holds the true range at every second"] = f"{always} {of}"
     report.rows["all: interval holds the true range at the end"] = f"{ended} {of}"
     report.rows["all: faulty sensor named"] = f"{named} {of}"
+    report.rows[f"all: named later than {GRACE:.0f} s"] = f"{slow} {of}"
     report.rows["all: a healthy sensor named as well"] = f"{others} {of}"
     return report
