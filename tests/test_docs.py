@@ -22,7 +22,7 @@ PAGES = [
 TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 RESULTS = [page for page in DOCS if page.parent.name == "results"]
 MEASURED_BY = re.compile(
-    r"`[^`]*?(?:python (?:-m )?([\w./]+)|make ([\w-]+)|gz-onboard (\w+))[^`]*`|python (benchmarks/\w+\.py)"
+    r"`[^`]*?(?:python (?:-m )?([\w./]+)|make ([\w-]+)|gz-onboard (\w+))[^`]*`|python (?:-m )?(benchmarks[./]\w+)"
 )
 MADE_WITH_THE_SITE = ("docs/api/", "docs/generated/")
 
