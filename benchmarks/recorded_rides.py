@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.offline.style import save
+from gz_onboard.reports.style import save
 from gz_onboard.simulation.figures import comparison
 from gz_onboard.simulation.plan import SimulationOptions, find_plan
 from gz_onboard.simulation.run import follow

@@ -36,7 +36,7 @@ from gz_onboard.discovery.baseline import baseline
 from gz_onboard.discovery.discovery import discover
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
-from gz_onboard.offline.schema import to_json
+from gz_onboard.reports.results import to_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests import plant
 from tests.plant.cases import CASES_OF_A_SCOOTER, CHANNEL_CLEAR, EFFECTS, ENERGY_CLEAR

@@ -24,7 +24,7 @@ from gz_onboard.discovery.extension import write_model
 from gz_onboard.discovery.result import METRICS, Gain
 from gz_onboard.discovery.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
+from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 

@@ -23,7 +23,7 @@ from gz_onboard.discovery.result import Report
 from gz_onboard.lab import estimate, validate
 from gz_onboard.model.effect import QUANTITIES, VEHICLE_PARAMETERS, Parameter, package_effects
 from gz_onboard.model.parameters import BATTERY_PARAMETERS
-from gz_onboard.offline.schema import descriptions
+from gz_onboard.reports.results import descriptions
 from gz_onboard.simulation import summary as simulated
 from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked
 

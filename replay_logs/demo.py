@@ -32,8 +32,8 @@ from gz_onboard.display.view import View
 from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
 from gz_onboard.log_rows import ESTIMATE_TOPIC
-from gz_onboard.offline.style import BLUE, INK, ORANGE, legend, new_figure, ordinate, rule, save
 from gz_onboard.recording.logs import read_frames, read_log
+from gz_onboard.reports.style import BLUE, INK, ORANGE, legend, new_figure, ordinate, rule, save
 from gz_onboard.state import state_file
 from gz_onboard.vehicle import read_vehicle
 

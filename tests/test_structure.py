@@ -26,6 +26,7 @@ LAYERS = [
     ["log_rows"],
     ["pipeline"],
     ["recording"],
+    ["reports"],
     ["offline"],
     ["simulation"],
     ["lab", "display"],
@@ -39,7 +40,7 @@ LAYERS = [
 ]
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 
-OFFLINE = ("recording", "offline", "simulation", "lab", "calibration", "discovery", "vehicle_check", "api")
+OFFLINE = ("recording", "offline", "reports", "simulation", "lab", "calibration", "discovery", "vehicle_check", "api")
 # Lower, and yet nothing that these need know.
 FORBIDDEN = {
     ("estimator", "can"): "events are all that the estimator sees of a bus",

@@ -11,9 +11,9 @@ from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.errors import brief
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.schema import descriptions
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
+from gz_onboard.reports.results import descriptions
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.check import Checked, RoleSeen, check_log, check_text
 from gz_onboard.vehicle_check.command import roles_text

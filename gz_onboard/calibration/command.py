@@ -20,11 +20,11 @@ from gz_onboard.calibration.table import read_table
 from gz_onboard.calibration.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.errors import OK, InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.model.effect import load_effect
-from gz_onboard.offline.results import write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
 from gz_onboard.recording.logs import logs_among
+from gz_onboard.reports.results import write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 

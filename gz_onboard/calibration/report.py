@@ -15,9 +15,9 @@ from gz_onboard.arrays import Array
 from gz_onboard.calibration import thesis
 from gz_onboard.calibration.fit import correlation
 from gz_onboard.calibration.result import Curve, Fit, Found, Panel, Result
-from gz_onboard.offline.page import drawn, html_table, write_page
-from gz_onboard.offline.schema import descriptions
-from gz_onboard.offline.style import MUTED, new_figure, rule
+from gz_onboard.reports.page import drawn, html_table, write_page
+from gz_onboard.reports.results import descriptions
+from gz_onboard.reports.style import MUTED, new_figure, rule
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,11 +23,11 @@ from gz_onboard.discovery.wording import Say
 from gz_onboard.errors import InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import distinct_names, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.logs import log_suffix, logs_among
+from gz_onboard.reports.results import distinct_names, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 

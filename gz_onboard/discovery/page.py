@@ -21,9 +21,9 @@ from gz_onboard.discovery.strain import in_words as strain_words
 from gz_onboard.discovery.unexplained import in_words
 from gz_onboard.discovery.verdict import Discovery
 from gz_onboard.discovery.wording import readable, with_unit
-from gz_onboard.offline.page import drawn, html_table, tiles, write_page
-from gz_onboard.offline.results import clock
-from gz_onboard.offline.style import save
+from gz_onboard.reports.page import drawn, html_table, tiles, write_page
+from gz_onboard.reports.results import clock
+from gz_onboard.reports.style import save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,7 +13,7 @@ from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.linear import LinearRide
 from gz_onboard.discovery.result import RIDE_TO_RIDE, Report, Unknown
 from gz_onboard.discovery.wording import readable
-from gz_onboard.offline.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
+from gz_onboard.reports.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

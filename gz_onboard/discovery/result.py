@@ -7,7 +7,7 @@ from typing import Annotated
 
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import brief
-from gz_onboard.offline.schema import OPTIONAL
+from gz_onboard.reports.results import OPTIONAL
 
 VERSION = 2  # of the keys: 1 had energy_per_way for consumption
 VERDICTS = {

@@ -16,7 +16,7 @@ from gz_onboard.discovery.strain import in_words as strain_words
 from gz_onboard.discovery.unexplained import in_words
 from gz_onboard.discovery.verdict import Discovery
 from gz_onboard.discovery.wording import readable, with_unit
-from gz_onboard.offline.results import clock
+from gz_onboard.reports.results import clock
 
 WIDTH = 118  # characters of a line
 ROWS = 3  # residuals and limits that are printed

@@ -26,12 +26,11 @@ from gz_onboard.lab.estimate_state import go_on, held
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, UNFIT, RideSummary, gains
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
-from gz_onboard.offline.results import Failure, clock, number, text_rows, write_json
-from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import Display, Progress, progress_bar
 from gz_onboard.recording.logs import is_table
+from gz_onboard.reports.results import Failure, clock, descriptions, number, text_rows, write_json
 from gz_onboard.vehicle import find_vehicle
 
 LEAST_MISSING = 1.0  # s: less is not told

@@ -14,11 +14,11 @@ from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.lab.estimate_log import EstimateTask
 from gz_onboard.lab.estimate_ride import open_estimate, vehicle_of
 from gz_onboard.lab.estimate_state import OVERTAKEN, StateAt, when
-from gz_onboard.offline.results import FIRST_DATE_NS
 from gz_onboard.offline.samples import facts_of
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.progress import Progress
 from gz_onboard.recording.timeline import on_timeline
+from gz_onboard.reports.results import FIRST_DATE_NS
 from gz_onboard.vehicle import Vehicle
 
 Unread: TypeAlias = tuple[EstimateTask, InputError]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gz_onboard.constants import WH
 from gz_onboard.events import Estimate, RouteState
-from gz_onboard.offline.results import number, times
+from gz_onboard.reports.results import number, times
 
 MOSTLY = 0.5  # of the ridden way on the route: where it was less, that is said
 

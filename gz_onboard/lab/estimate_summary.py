@@ -13,9 +13,8 @@ from gz_onboard.events import WINDOW, Estimate, Reason, State
 from gz_onboard.lab.estimate_ride import Ridden
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.why import Why, why_of
-from gz_onboard.offline.results import leap_text, times
-from gz_onboard.offline.schema import to_json
 from gz_onboard.pipeline import lacking
+from gz_onboard.reports.results import leap_text, times, to_json
 from gz_onboard.vehicle import Vehicle
 
 SUMMARY_VERSION = 1

@@ -11,8 +11,8 @@ from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import State
 from gz_onboard.imports import require
 from gz_onboard.lab.estimate_summary import RideSummary
-from gz_onboard.offline.results import Failure
 from gz_onboard.offline.write_tables import write_table
+from gz_onboard.reports.results import Failure
 
 FORMATS = (".csv", ".parquet", ".jsonl")
 _HINTS = get_type_hints(RideSummary)

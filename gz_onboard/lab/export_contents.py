@@ -11,9 +11,9 @@ import numpy as np
 
 from gz_onboard.can.codec import BACK_NS
 from gz_onboard.lab.export_tables import recorded_messages
-from gz_onboard.offline.results import clock, text_rows
 from gz_onboard.recording import logs
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.reports.results import clock, text_rows
 
 
 @dataclass(frozen=True)

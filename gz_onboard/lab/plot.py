@@ -19,7 +19,10 @@ from gz_onboard.errors import BAD_INPUT, OK, InputError, writing
 from gz_onboard.events import Activity, Reason, State, words
 from gz_onboard.lab.logged import Logged, read_ride
 from gz_onboard.lab.why import plot_why
-from gz_onboard.offline.style import (
+from gz_onboard.options import PICTURE_FORMATS, add_shared
+from gz_onboard.recording.logs import logs_among, read_metadata
+from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.reports.style import (
     BLUE,
     GREEN,
     MUTED,
@@ -36,9 +39,6 @@ from gz_onboard.offline.style import (
     stack,
     time_unit,
 )
-from gz_onboard.options import PICTURE_FORMATS, add_shared
-from gz_onboard.recording.logs import logs_among, read_metadata
-from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

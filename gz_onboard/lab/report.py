@@ -13,11 +13,11 @@ from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.report_page import cells, contents, section
 from gz_onboard.lab.report_ride import ReportedRide, ReportTask, read_report
 from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.page import page
 from gz_onboard.offline.processes import collect, over_rides
 from gz_onboard.offline.samples import ride_name
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.reports.page import page
 from gz_onboard.vehicle import find_vehicle
 
 

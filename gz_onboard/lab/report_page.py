@@ -16,9 +16,9 @@ from gz_onboard.lab.report_charts import Abscissa, ChartLine, bar, chart, key, s
 from gz_onboard.lab.report_ride import ReportedRide
 from gz_onboard.lab.report_svg import axis_of, draw_map
 from gz_onboard.lab.why import Why
-from gz_onboard.offline.page import tiles
-from gz_onboard.offline.results import FIRST_DATE_NS, clock, number
-from gz_onboard.offline.style import time_unit
+from gz_onboard.reports.page import tiles
+from gz_onboard.reports.results import FIRST_DATE_NS, clock, number
+from gz_onboard.reports.style import time_unit
 
 _STATE_COLOURS = {State.STARTING: "grey", State.VALID: "green", State.DEGRADED: "amber", State.INVALID: "red"}
 _TEMPERATURE_COLOURS = {"motor_temperature": "red", "inverter_temperature": "purple", "ambient_temperature": "blue"}

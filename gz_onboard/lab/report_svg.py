@@ -1,7 +1,7 @@
 """Lines, bands and stretches as SVG inside a page, no finer than a screen shows.
 
 The pictures are stretched to the width that there is; texts stand beside them as HTML, of one size on every screen.
-All colours are names of classes (`offline.page`), for light and dark.
+All colours are names of classes (`reports.page`), for light and dark.
 """
 
 from __future__ import annotations

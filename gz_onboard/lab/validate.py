@@ -17,12 +17,11 @@ from gz_onboard.lab.validate_ride import PICTURE, log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, channel_words, pooled
 from gz_onboard.lab.validate_soc import soc_text
 from gz_onboard.lab.validate_thesis import of_component
-from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
-from gz_onboard.offline.results import write_json
-from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
+from gz_onboard.reports.page import mark_of, write_below
+from gz_onboard.reports.results import descriptions, write_json
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 SUMMARY_VERSION = 1

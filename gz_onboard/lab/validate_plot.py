@@ -12,7 +12,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
 from gz_onboard.lab.validate_score import CHANNELS, GIVEN, NAMES, ValidatedRide
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, save, time_unit
+from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, save, time_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

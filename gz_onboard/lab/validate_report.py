@@ -21,8 +21,8 @@ from gz_onboard.lab.validate_score import (
     channel_words,
 )
 from gz_onboard.lab.validate_thesis import HEAD, beside_thesis
-from gz_onboard.offline.page import Failed, Subheading, html_table, image, markdown_table, write_page
-from gz_onboard.offline.results import number
+from gz_onboard.reports.page import Failed, Subheading, html_table, image, markdown_table, write_page
+from gz_onboard.reports.results import number
 
 Forms = Mapping[str, Mapping[str, Mapping[str, Mapping[str, PooledMeans]]]]
 """Pooled means by form, channel, sorting and condition."""

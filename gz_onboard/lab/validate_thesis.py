@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gz_onboard.lab.validate_score import COMPONENT_GATE, GATE, ChannelErrors, ValidatedRide, channel_words
-from gz_onboard.offline.page import Failed
+from gz_onboard.reports.page import Failed
 
 SIMULATED = ("pack_current", "pack_voltage", "motor_torque", "motor_speed")
 """The four signals of the thesis' gate."""

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 from gz_onboard.errors import InputError
 from gz_onboard.events import TOLD, Cause, Explanation, cause_words
 from gz_onboard.log_rows import WHY_TOPIC
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, RED, headline, new_figure, rule, save
 from gz_onboard.recording.logs import read_samples
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, RED, headline, new_figure, rule, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,7 @@ import numpy as np
 from gz_onboard.constants import WH
 from gz_onboard.events import words
 from gz_onboard.model.effect import Effect, Port
-from gz_onboard.offline.style import (
+from gz_onboard.reports.style import (
     BLUE,
     GREEN,
     INK,

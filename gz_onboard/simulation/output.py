@@ -11,8 +11,8 @@ from pathlib import Path
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import writable, writing
-from gz_onboard.offline.page import drawn, write_page
-from gz_onboard.offline.style import save
+from gz_onboard.reports.page import drawn, write_page
+from gz_onboard.reports.style import save
 from gz_onboard.simulation.frames import Dropouts, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run

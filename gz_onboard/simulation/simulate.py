@@ -16,9 +16,9 @@ from typing import Any
 from gz_onboard.constants import HOUR, WH_PER_KM
 from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.imports import require
-from gz_onboard.offline.results import times, write_json
 from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.reports.results import times, write_json
 from gz_onboard.simulation.frames import Dropouts, check_output, messages_sent
 from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis

@@ -10,8 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
-from gz_onboard.offline.results import clock, number, plain, text_rows, times
-from gz_onboard.offline.schema import descriptions
+from gz_onboard.reports.results import clock, descriptions, number, plain, text_rows, times
 from gz_onboard.simulation.beyond import LOADED
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded

@@ -19,9 +19,9 @@ from gz_onboard.can.requests import NEGATIVE
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
 from gz_onboard.lab.estimate_tally import PAUSE
-from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.reports.results import clock, leap_text
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check import charge, electric, motion, others
 from gz_onboard.vehicle_check.features import NEEDS, Feature, features_of, features_text

@@ -12,7 +12,7 @@ import numpy as np
 from gz_onboard.errors import InputError
 from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
 from gz_onboard.lab.estimate_summary import UNFIT, summary_of
-from gz_onboard.offline.results import clock
+from gz_onboard.reports.results import clock
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.electric import PackRide
 from gz_onboard.vehicle_check.finding import Finding, right, unknown, wrong

@@ -10,8 +10,8 @@ import pytest
 
 from gz_onboard.calibration.report import write_report
 from gz_onboard.calibration.result import Panel, PlotLine, Result
-from gz_onboard.offline.page import drawn, html_table, tiles, write_page
-from gz_onboard.offline.style import new_figure
+from gz_onboard.reports.page import drawn, html_table, tiles, write_page
+from gz_onboard.reports.style import new_figure
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext

@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.calibration.report import VERSION, document, picture, plus_minus, text, thinned, write_report
 from gz_onboard.calibration.result import Curve, Fit, Found, Panel, PlotLine, Result
-from gz_onboard.offline.results import write_json
+from gz_onboard.reports.results import write_json
 
 NAN = float("nan")
 

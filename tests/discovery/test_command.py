@@ -13,7 +13,7 @@ from gz_onboard.discovery.discovery import discover
 from gz_onboard.discovery.result import Report
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.offline.schema import descriptions
+from gz_onboard.reports.results import descriptions
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect

@@ -27,8 +27,8 @@ from gz_onboard.lab.validate_soc import soc_reference
 from gz_onboard.model.model import Model
 from gz_onboard.model.parameters import Parameters
 from gz_onboard.offline.arrays import block_means
-from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.samples import read_samples
+from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.simulation.recorded import read_recorded, rest_soc
 from gz_onboard.vehicle import OWN, read_vehicle
 

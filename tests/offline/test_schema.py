@@ -18,7 +18,7 @@ from gz_onboard.discovery.result import (
     Split,
     Unknown,
 )
-from gz_onboard.offline.schema import OPTIONAL, descriptions, to_json
+from gz_onboard.reports.results import OPTIONAL, descriptions, to_json
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.offline.page import markdown_table
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, RED, new_figure, rule, save
+from gz_onboard.reports.page import markdown_table
+from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, RED, new_figure, rule, save
 from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, RoadConditions, step
 from gz_onboard.simulation.turning.planar import Planar

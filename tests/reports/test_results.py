@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.page import Failed, Subheading, html_table, markdown_table, write_page
-from gz_onboard.offline.results import clock, number, text_rows, times, write_json
-from gz_onboard.offline.schema import descriptions, to_json
+from gz_onboard.reports.page import Failed, Subheading, html_table, markdown_table, write_page
+from gz_onboard.reports.results import clock, descriptions, number, text_rows, times, to_json, write_json
 
 NAN = float("nan")
 

@@ -1,16 +1,19 @@
-"""Results of a command: as JSON by one writer, with keys that explain themselves, and as text."""
+"""Results of a command: dataclasses as JSON by one writer, with keys that explain themselves, and as text.
+
+A field's description is in its type, ``Annotated[float, "of the energy"]``.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from decimal import Decimal
+from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args, get_type_hints
 
 from gz_onboard.errors import InputError, writing
-from gz_onboard.offline.schema import to_json
 
 FIRST_DATE_NS = 946_684_800_000_000_000
 """A log before 2000 has no date [ns since the epoch]: its clock was not set."""
@@ -40,6 +43,45 @@ def write_json(file: str | None, version: int | None, result: object) -> None:
         return
     with writing(file):
         Path(file).write_text(text + "\n", encoding="utf-8", errors="replace")
+
+
+OPTIONAL = object()
+"""``Annotated[..., OPTIONAL]``: a field that is left out of the JSON where it is None."""
+
+
+def to_json(value: Any) -> Any:
+    """`value` in the types that a JSON file has; dataclasses as objects, in the order of their fields.
+
+    Arrays become lists, numbers that are not finite None.
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if isfinite(value) else None
+    if is_dataclass(value) and not isinstance(value, type):
+        omitted = _optional(type(value)) if any(getattr(value, f.name) is None for f in fields(value)) else ()
+        pairs = [(f.name, getattr(value, f.name)) for f in fields(value)]
+        return {name: to_json(x) for name, x in pairs if x is not None or name not in omitted}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(x) for key, x in value.items()}
+    if isinstance(value, Sequence):
+        return [to_json(x) for x in value]
+    if hasattr(value, "tolist"):  # of numpy
+        return to_json(value.tolist())
+    return str(value)
+
+
+def descriptions(kind: Any) -> dict[str, str]:
+    """Of each field of a dataclass that has one, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    texts = {f.name: [x for x in get_args(hints[f.name])[1:] if isinstance(x, str)] for f in fields(kind)}
+    return {name: text[0] for name, text in texts.items() if text}
+
+
+def _optional(kind: Any) -> frozenset[str]:
+    """The fields of a dataclass that are left out where they are None."""
+    hints = get_type_hints(kind, include_extras=True)
+    return frozenset(f.name for f in fields(kind) if OPTIONAL in getattr(hints[f.name], "__metadata__", ()))
 
 
 # --- names of files -----------------------------------------------------------------------------------------------

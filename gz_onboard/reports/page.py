@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from gz_onboard.errors import writable
-from gz_onboard.offline.style import picture_format, write
+from gz_onboard.reports.style import picture_format, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,8 @@ import re
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.page import image
-from gz_onboard.offline.style import new_figure, save
+from gz_onboard.reports.page import image
+from gz_onboard.reports.style import new_figure, save
 
 
 def figure():
