@@ -8,8 +8,7 @@ between them with climbs of some kilometres, one has an aged pack (20 % less cap
 twice), one a tyre that loses its air after 40 minutes. Healthy logs are also read from 60 % of charge on. A week has
 fifteen rides of 4 to 9 km with rests and charges; the state is kept.
 
-Seeds below 1000 are for development; those below 1125 were seen while the forecast was corrected, so the tables begin
-behind them.
+Seeds below 1000 are for development; those below 1125 were seen while the forecast was corrected.
 """
 
 from __future__ import annotations

@@ -414,8 +414,7 @@ def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict
     groups = {f"{t}": [c for c in work if c.temperature == t and "trise" not in c.name] for t in TEMPERATURES}
     groups["rising"] = [c for c in work if "trise" in c.name]
     for name, group in groups.items():
-        plain = {text: case for case, text in CASES.items() if text in DRAWN}  # without an offset
-        found = {text: [scores[setting.name, c, case] for c in group] for text, case in plain.items()}
+        found = {"wrong": [scores[setting.name, c, Case(WRONG, sd=-WRONG)] for c in group]}
         found |= {f"{text}, drawn": [scores[setting.name, c, random[text, c]] for c in group] for text in DRAWN}
         for text, mine in found.items() if group else ():
             near = np.array([s.near for s in mine])

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import multiprocessing
 import os
 import pickle
@@ -161,14 +160,6 @@ def healthy_document(rows: Sequence[Row], first: int, commit: str) -> str:
     for against, words in (("baseline", "baseline of eight rides"), ("file", "the vehicle file alone")):
         mine = [row for row in rows if row["against"] == against]
         lines.append(f"| {words} | {share(alarm(row) for row in mine)} |")
-    lines += ["", "| seed | known from | said | causes | ambiguous | without a name |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        if alarm(row):
-            groups = "; ".join(" / ".join(names) for names in row["ambiguous"])
-            curve = row["unknown"]
-            unnamed = f"{curve['channel']} over {curve['quantity']}" if curve else ""
-            said = f"{row['verdict']} | {', '.join(named(row))} | {groups} | {unnamed}"
-            lines.append(f"| {row['seed']} | {row['against']} | {said} |")
     return "\n".join([*lines, ""])
 
 
@@ -239,15 +230,6 @@ def gains(rows: Sequence[Row]) -> list[tuple[str, float, float, float, float]]:
     return out
 
 
-def strength(truth: Row) -> str:
-    """Weak, middle or strong: thirds of the range that strengths are drawn from."""
-    if truth["name"] not in EFFECTS:
-        return "any"
-    _, _, weak, strong = EFFECTS[truth["name"]]
-    x = math.log(math.hypot(*truth["change"]) / weak) / math.log(strong / weak)
-    return ("weak", "middle", "strong")[min(max(int(3 * x), 0), 2)]
-
-
 def summary(rows: Sequence[Row]) -> dict[str, str]:
     """The lines that count."""
     pairs = [(row, t) for row in rows if row["kind"] in ("one", "two", "look-alike") for t in row["truths"]]
@@ -303,32 +285,15 @@ def summary(rows: Sequence[Row]) -> dict[str, str]:
 
 def by_effect(rows: Sequence[Row]) -> list[str]:
     """A line for each effect."""
-    lines = [
-        "| effect | clear: top / in set / of | weak: top / of | intervals held | median error of the change |",
-        "|---|---|---|---|---|",
-    ]
+    lines = ["| effect | clear: top/in set/all | weak: top/all | intervals held |", "|---|---|---|---|"]
     for name in EFFECTS:
         pairs = [(r, t) for r in rows if r["kind"] != "unknown" for t in r["truths"] if t["name"] == name]
         clear, faint = [p for p in pairs if p[1]["clear"]], [p for p in pairs if not p[1]["clear"]]
         checks = [c for r in rows for c in r.get("parameters", []) if c["effect"] == name]
-        error = np.median([abs(c["value"] - c["true"]) / abs(c["change"]) for c in checks]) if checks else np.nan
+        found = sum(t["name"] in reported(r) for r, t in clear)
         lines.append(
-            f"| {name} | {sum(right(*p) for p in clear)} / {sum(t['name'] in reported(r) for r, t in clear)} / "
-            f"{len(clear)} | {sum(right(*p) for p in faint)} / {len(faint)} | "
-            f"{sum(c['held'] for c in checks)} of {len(checks)} | {f'{100 * error:.0f} %' if checks else ''} |"
-        )
-    return lines
-
-
-def by_strength(rows: Sequence[Row]) -> list[str]:
-    """A line for each third of the strengths."""
-    lines = ["| strength | top cause | in the reported set | nothing found |", "|---|---|---|---|"]
-    pairs = [(r, t) for r in rows if r["kind"] in ("one", "two", "look-alike") for t in r["truths"]]
-    for level in ("weak", "middle", "strong"):
-        here = [(r, t) for r, t in pairs if strength(t) == level]
-        lines.append(
-            f"| {level} third | {share(right(r, t) for r, t in here)} | "
-            f"{share(t['name'] in reported(r) for r, t in here)} | {share(r['verdict'] == 'none' for r, _ in here)} |"
+            f"| {name} | {sum(right(*p) for p in clear)}/{found}/{len(clear)} | "
+            f"{sum(right(*p) for p in faint)}/{len(faint)} | {sum(c['held'] for c in checks)}/{len(checks)} |"
         )
     return lines
 
@@ -365,11 +330,7 @@ def document(rows: Sequence[Row], first: int, commit: str, took: float) -> str:
         "first or in the ambiguous",
         "set. *Reported set*: causes and ambiguous sets. *Oracle*: the same rides with nothing hidden.",
         "",
-        "## By strength (`--rows FILE` writes every case)",
-        "",
-        *by_strength(rows),
-        "",
-        "## By effect",
+        "## By effect (`--rows FILE` writes every case)",
         "",
         *by_effect(rows),
         "",

@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a reader of the page has."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "effects").mkdir()
-    for name, text in zip(("top_box", "flat_spot", "heated_grips"), blocks("python"), strict=True):
+    for name, text in zip(("top_box", "heated_grips"), blocks("python"), strict=True):
         (folder / "effects" / f"{name}.py").write_text(text, encoding="utf-8")
     model, box, grips = blocks("toml")
     write_vehicle(folder / "boxed.toml", model, box)
@@ -69,7 +69,7 @@ def test_its_commands_give_what_it_shows(folder: Path):
     assert low < found.parameters["heated_grips_power"] < high
 
 
-@pytest.mark.parametrize("name", ["top_box", "flat_spot", "heated_grips"])
+@pytest.mark.parametrize("name", ["top_box", "heated_grips"])
 def test_its_effects_keep_to_the_contract(folder: Path, name: str):
     effect = load_effect(name, folder / "effects")
     values = Bound(effect, {**read_vehicle("reference").parameters, **{p.name: p.prior for p in effect.parameters}})
