@@ -32,15 +32,15 @@ def tables(reports: dict[str, Report], seed: int, share: float) -> str:
 
 def table(name: str, report: Report) -> str:
     """One of them."""
-    text = f"\n### {kinds()[name].TITLE}\n\n| what | measured |\n| --- | --- |\n"
+    text = f"\n## {kinds()[name].TITLE}\n\n| what | measured |\n| --- | --- |\n"
     text += "".join(f"| {what} | {value} |\n" for what, value in report.rows.items())
     return text + f"| cases that broke a promise | {len(report.failures)} |\n"
 
 
 def replaced(page: str, name: str, report: Report) -> str:
     """The page with this kind's table as it is now."""
-    before, title, rest = page.partition(f"\n### {kinds()[name].TITLE}\n")
-    end = min((at for at in (rest.find("\n### "), rest.find("\n" + END)) if at >= 0), default=len(rest))
+    before, title, rest = page.partition(f"\n## {kinds()[name].TITLE}\n")
+    end = min((at for at in (rest.find("\n## "), rest.find("\n" + END)) if at >= 0), default=len(rest))
     return before + table(name, report) + rest[end:] if title else page
 
 
