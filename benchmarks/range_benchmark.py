@@ -345,7 +345,8 @@ def picture(judged: Judged, file: Path) -> None:
 
 def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: str) -> str:
     """docs/results/range-benchmark.md."""
-    lines = ["# Range benchmark", "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
+    first = "Error and interval of the range on full discharges of simulated scooters, against usual estimators."
+    lines = ["# Range benchmark", "", first, "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
     lines += [
         f"Made by `{command}` on commit {version}; `--json FILE` writes every ride.",
         "",

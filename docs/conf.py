@@ -62,7 +62,7 @@ def write_api_pages() -> None:
 
 
 def import_types() -> None:
-    """What modules import for type checkers alone, so that every annotation has its full name."""
+    """Import the names of TYPE_CHECKING blocks, so that every annotation resolves."""
     package = importlib.import_module(PACKAGE)
     names = [info.name for info in pkgutil.walk_packages(package.__path__, f"{PACKAGE}.")]
     for module in [importlib.import_module(name) for name in names if not name.endswith("__main__")]:
@@ -74,7 +74,7 @@ def import_types() -> None:
 def exists(
     app: Sphinx, environment: BuildEnvironment, node: pending_xref, shown: nodes.TextElement
 ) -> nodes.TextElement | None:
-    """Text without a link for a name that has no entry here, if it exists: another package's, a type variable."""
+    """Return text without a link for an existing name without an entry, such as one of another package."""
     module, _, name = str(node["reftarget"]).partition("[")[0].rpartition(".")
     places = [sys.modules.get(module or str(node.get("py:module"))), builtins]
     outside = module and not module.startswith(PACKAGE)
@@ -82,14 +82,14 @@ def exists(
 
 
 def hide_long_values(app: Sphinx, page: nodes.document) -> None:
-    """A table of constants is to be read in the code."""
+    """Remove long values of constants from a page."""
     for node in list(page.findall(desc_annotation)):
         if len(node.astext()) > LONGEST_VALUE and " = " in node.astext()[:10]:
             node.parent.remove(node)
 
 
 def as_rst(lines: list[str]) -> list[str]:
-    """A docstring as reStructuredText: paragraphs, lists with "- ", `code`; what is indented is shown as it is."""
+    """Return a docstring as reStructuredText: paragraphs, lists with "- ", `code`; indented lines become literal."""
     result: list[str] = []
     item = literal = False
     for line in lines:
@@ -113,7 +113,7 @@ def as_rst(lines: list[str]) -> list[str]:
 
 
 def inline(line: str) -> str:
-    """Code stays code, all else is text: no character of an equation is markup, no first word a list or a directive."""
+    """Escape everything but code, so that equations and first words are not taken for markup."""
     parts = re.split(r"(``[^`]+``|`[^`]+`)", re.sub(r"::$", ":", line.rstrip()))
     code = [f"``{part.strip('`')}``" for part in parts[1::2]]
     text = [re.sub(r"([*_|\\])", r"\\\1", part) for part in parts[::2]]
@@ -123,7 +123,7 @@ def inline(line: str) -> str:
 
 
 def setup(app: Sphinx) -> None:
-    """Called by Sphinx."""
+    """Connect the handlers; Sphinx calls this."""
     import_types()
     write_api_pages()
     importlib.import_module("reference").write_pages(ROOT / "docs" / "generated")

@@ -1,4 +1,4 @@
-"""What a shell has of the command line, made out of it: a manual page, and completions for bash and zsh.
+"""Write a manual page and completions for bash and zsh from the command line's parser.
 
 make man    # build/shell/gz-onboard.1, build/shell/gz-onboard.bash, build/shell/_gz-onboard
 """
@@ -29,7 +29,7 @@ OR_FILE = {  # names in place of which a file may be given, by the function that
 
 
 def actions_of(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """The arguments of a command line and of its commands."""
+    """Yield all arguments of a parser and its commands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
@@ -38,7 +38,7 @@ def actions_of(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def completion(shell: str) -> str:
-    """The script that completes the command line in ``bash`` or ``zsh``; where a file is wanted, by files."""
+    """Return the completion script for ``bash`` or ``zsh``; arguments that take a file complete file names."""
     parser = command_line(COMMANDS)
     for action in actions_of(parser):
         if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT", "LOG"):
@@ -58,7 +58,7 @@ ZSH = """{name}() {{
 
 
 def named_by(action: argparse.Action) -> str:
-    """The function of `OR_FILE` that completes it, or nothing."""
+    """Return the function of `OR_FILE` that completes an argument, or an empty string."""
     if "NAME|TOML" in str(action.metavar):
         return "_gz_onboard_vehicles"
     if action.metavar != "WHAT":
@@ -67,12 +67,12 @@ def named_by(action: argparse.Action) -> str:
 
 
 def preamble(function: str) -> str:
-    """The functions of `OR_FILE` for a shell."""
+    """Return the functions of `OR_FILE` for a shell."""
     return "\n".join(function.format(name=name, names=" ".join(names)) for name, names in OR_FILE.items())
 
 
 def manual() -> str:
-    """The manual page, as troff."""
+    """Return the manual page as troff."""
     os.environ["COLUMNS"] = "80"  # which argparse breaks its lines at
     parser = command_line(COMMANDS)
     lines = [f'.TH GZ\\-ONBOARD 1 "" "gz\\-onboard {__version__}" ""']
@@ -92,23 +92,23 @@ def manual() -> str:
 
 
 def plain(text: str) -> str:
-    """A paragraph as troff has it: no character is markup."""
+    """Return a paragraph with troff's markup characters escaped."""
     return escaped(" ".join(text.split()))
 
 
 def escaped(line: str) -> str:
-    """A line as troff has it: no character is markup, and it is no request."""
+    """Return a line with troff's markup characters and request dots escaped."""
     line = line.replace("\\", "\\e").replace("-", "\\-")
     return f"\\&{line}" if line.startswith((".", "'")) else line
 
 
 def literal(text: str) -> list[str]:
-    """Lines that stay as they are."""
+    """Return lines in a block without filling."""
     return [".PP", ".nf", *map(escaped, text.strip("\n").splitlines()), ".fi"]
 
 
 def main() -> None:
-    """Write the files to the folder that is named."""
+    """Write all files to the folder on the command line."""
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     files = {"gz-onboard.1": manual(), "gz-onboard.bash": completion("bash"), "_gz-onboard": completion("zsh")}

@@ -38,7 +38,7 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def ran() -> dict[str, Any]:
-    """What the cells leave in the names that they share; pictures are drawn to no screen."""
+    """Run all cells without a screen and return the figures that the tests check."""
     environment = os.environ | {"MPLBACKEND": "agg", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-W", "ignore:FigureCanvasAgg", "-c", RUN]
     done = subprocess.run(

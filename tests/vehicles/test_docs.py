@@ -1,4 +1,4 @@
-"""The guide to another vehicle is true: its commands run, its snippets stand in the files; no key is undocumented."""
+"""The guide to another vehicle matches the code: commands run, snippets are in the files, all keys are documented."""
 
 from __future__ import annotations
 
