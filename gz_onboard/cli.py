@@ -35,7 +35,6 @@ COMMANDS = {
     "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or its contents to Parquet, CSV, ..."),
     "vehicle": ("gz_onboard.vehicle_check.command", "begin a vehicle file, or check it against the vehicle's logs"),
     "report": ("gz_onboard.lab.report", "show recorded rides as one self-contained HTML page, also for phones"),
-    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }
 
 

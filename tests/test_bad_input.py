@@ -18,7 +18,6 @@ READING = {
     "report": ["report", "LOG"],
     "check": ["vehicle", "check", "reference", "LOG"],
     "export": ["export", "LOG", "out", "--vehicle", "reference"],
-    "why": ["plot", "--why", "LOG"],
 }
 WRONG = [
     (["report", "ride.blf", "-o", "ride.pdf"], "ride.pdf: the report is a page in HTML; give it a name that ends in"),
@@ -36,8 +35,6 @@ WRONG = [
     ),
     (["learned", "--state", "hello.txt"], "hello.txt: is not a saved state; choose another state file or vehicle"),
     (["learned", "--state", "folder"], "it is not a file; choose another state file or vehicle"),
-    (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
-    (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),
 ]
 
 
@@ -71,7 +68,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 @pytest.mark.parametrize("arguments", READING.values(), ids=READING)
 def test_a_log_that_is_none(arguments, capsys):
     logs = {"rid.blf": MISSING, "empty.blf": EMPTY, "hello.txt": NO_SUFFIX}
-    if arguments[0] not in ("plot", "export"):  # which read any vehicle's
+    if arguments[0] != "export":  # which read any vehicle's
         logs["another.log"] = ANOTHER
     for log, said in logs.items():
         assert f"{log}: " in (told := refused(capsys, *(log if x == "LOG" else x for x in arguments)))
@@ -95,7 +92,6 @@ def test_what_does_not_fit(arguments, said, capsys):
         ["report", "ride.blf", "--output", "NAME"],
         ["vehicle", "check", "NAME", "ride.blf"],
         ["learned", "--state", "NAME"],
-        ["plot", "NAME"],
         ["export", "ride.blf", "NAME.csv"],
         ["validate", "NAME"],
         ["calibrate", "all", "NAME"],
@@ -112,4 +108,4 @@ def test_a_name_that_no_file_can_have(arguments, capsys):
 def test_the_parts_of_a_command_are_named(capsys):
     with pytest.raises(SystemExit):
         cli.main(["vehicle"])
-    assert "new|check|maps" in capsys.readouterr().err
+    assert "new|check" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.cli import COMMANDS, command_line, main
-from gz_onboard.lab import plot
+from gz_onboard.lab import report
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect
 
@@ -94,8 +94,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["export", RIDE, "x.csv", "--table-format", "csv"], "is for a folder of tables, and x.csv is a file"),
         (["export", RIDE, "--columns", "range"], "--columns: chooses what is written to OUT, which is missing"),
         (["export", RIDE, "--to", "5"], "--to: chooses what is written to OUT, which is missing"),
-        (["plot", "nowhere.mcap"], "nowhere.mcap"),
-        (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
+        (["report", "nowhere.mcap"], "nowhere.mcap"),
         (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),
         (["replay", "nowhere.blf", "--channel", "a"], "nowhere.blf"),
         (["run", "--vehicle", f"{LOGS}/"], "is a folder; give a vehicle file, which ends in .toml"),
@@ -248,8 +247,8 @@ def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):
     def interrupted(_: argparse.ArgumentParser) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(plot, "add_arguments", interrupted)
-    assert status("plot", "a.mcap") == 130
+    monkeypatch.setattr(report, "add_arguments", interrupted)
+    assert status("report", "a.mcap") == 130
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

@@ -27,7 +27,6 @@ TAKING = {
     "discover": ["discover", EMPTY],
     "export": ["export", EMPTY, "out"],
     "report": ["report", EMPTY, "-o", "ride.html"],
-    "plot": ["plot", EMPTY],
     "vehicle": ["vehicle", "check", "reference", EMPTY],
 }
 # Those for which one has no meaning, and what they say. A folder of measurements is `calibrate all`'s.
@@ -50,7 +49,6 @@ MORE = [
     (["vehicle", "check", "a.blf.gz", "v.toml"], "a.blf.gz: is a log; the vehicle comes first"),
     (["vehicle", "check", "vehicles", RIDE], "is a folder; give a vehicle file, which ends in .toml"),
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
-    (["plot", FULL, "one.png"], "one.png: of a folder, each picture has the name of its log; leave it out"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),
     (["replay", FULL, "--from", "3"], "--from and --to: apply to one log, and FULL holds 2; give one of them"),
 ]

@@ -221,31 +221,16 @@ def test_the_daemon_runs_on_the_board(board, tmp_path):
     assert run(board / "gz-onboard", "export", log, tmp_path / "signals.jsonl").stdout
 
 
-@pytest.fixture(scope="module")
-def estimated(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of estimates, which the board makes without pictures."""
-    folder = tmp_path_factory.mktemp("estimated")
-    run(board / "gz-onboard", "estimate", LOGS / "coastdown.blf", "--no-plot", "--output", folder)
-    return folder / "coastdown.estimate.mcap"
-
-
 def test_a_simulation_without_pictures_needs_no_lab(board, tmp_path):
     run(board / "gz-onboard", "simulate", "ece15", "--no-plot", "--format", "csv", cwd=tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["ece15.simulation.csv"]
 
 
-def test_the_page_of_a_ride_needs_no_lab(board, tmp_path):
-    told = run(board / "gz-onboard", "report", LOGS / "coastdown.blf", cwd=tmp_path)
-    assert told.stdout == "coastdown.html\n"
-    assert "<svg" in (tmp_path / "coastdown.html").read_text()
-
-
-@pytest.mark.parametrize("command", ["estimate", "simulate", "validate", "calibrate", "discover", "plot"])
-def test_a_command_of_the_lab_says_what_to_install(board, estimated, tmp_path, command):
+@pytest.mark.parametrize("command", ["estimate", "simulate", "validate", "calibrate", "discover", "report"])
+def test_a_command_of_the_lab_says_what_to_install(board, tmp_path, command):
     arguments: dict[str, list[object]] = {
         "simulate": ["ece15"],
         "calibrate": ["motor", LOGS / "calibration/motor_dyno.csv.gz"],
-        "plot": [estimated, "x.png"],
     }
     given = arguments.get(command, [LOGS / "coastdown.blf"])
     told = run(board / "gz-onboard", command, *given, cwd=tmp_path, status=2)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 VERSION = 1
 _COLOURS = ("#1f6feb", "#d1495b", "#2a9d8f", "#e9a03b", "#7b5ea7", "#52606d", "#8c564b", "#17a2b8")
 _MOST_POINTS = 4000  # of a trace: more than a picture shows
-_PICTURE_COLOURS = 16  # of a picture: a panel has few lines
 _MOST_OPEN = 8  # panels of a procedure: more are behind a click
 _MOST_TIED = 12  # parameters: a table of more correlations is not read
 
@@ -180,7 +179,7 @@ def picture(panel: Panel) -> str:
     figure.set_layout_engine("constrained")
     _draw(figure.add_subplot(), panel)
     title = f"<figcaption><b>{html.escape(panel.title)}</b></figcaption>"
-    return f"<figure>{title}{drawn(figure, panel.title, _PICTURE_COLOURS)}</figure>"
+    return f"<figure>{title}{drawn(figure, panel.title)}</figure>"
 
 
 def _draw(axis: Axes, panel: Panel) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 
@@ -15,13 +16,16 @@ from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through, vehicle_of
 from gz_onboard.lab.estimate_state import StateAt, latest, text_of
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, kept_summary, summary_of, summary_to_keep
-from gz_onboard.lab.plot import plot_log
+from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import of_ride
 from gz_onboard.pipeline import dbc_texts, lacking
 from gz_onboard.progress import Progress
-from gz_onboard.recording.logs import ESTIMATED, read_metadata
+from gz_onboard.recording.logs import ESTIMATED, read_metadata, read_samples
+from gz_onboard.reports.charts import overview
+from gz_onboard.reports.results import clock, number
+from gz_onboard.reports.style import save
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 
@@ -87,9 +91,21 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
         with writing(task.state.file):
             state.write(task.state.file, learned)
     if task.picture:
-        with writing(task.picture):
-            plot_log(task.log, task.picture)
+        _draw(task.log, summary, task.picture)
     return summary
+
+
+def _draw(log: Path, s: RideSummary, picture: Path) -> None:
+    """Draw the estimates of a log into `picture`. Raises InputError."""
+    start = datetime.fromtimestamp(s.start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    charge = f"state of charge {number(s.soc_start, '.1f', '', 100)} → {number(s.soc_end, '.1f', '%', 100)}"
+    band = f"({number(s.range_end_p10_km, '.1f')}–{number(s.range_end_p90_km, '.1f')})"
+    parts = [start, clock(s.duration_s), f"{s.distance_km:z.2f} km", charge]
+    parts += [f"range at the end {number(s.range_end_km, '.1f', 'km')} {band}"]
+    rows = [values for topic, _, values in read_samples(log) if topic == ESTIMATE_TOPIC]
+    title = f"{Path(s.file).name} · {s.vehicle}"
+    with writing(picture):
+        save(overview(rows, title, "  ·  ".join(["damaged log"] * bool(s.damage) + parts)), picture)
 
 
 def _link(ridden: Ridden, learned: bytes | None) -> dict[str, str]:
@@ -161,8 +177,7 @@ def _kept(task: EstimateTask, made_of: Mapping[str, str]) -> RideSummary | None:
     if kept is None:
         return None
     if task.picture and not _is_drawn(task.picture, task.log):
-        with writing(task.picture):
-            plot_log(task.log, task.picture)
+        _draw(task.log, kept, task.picture)
     return kept
 
 

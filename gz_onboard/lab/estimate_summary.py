@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, cast
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR, WH, WH_PER_KM
-from gz_onboard.events import WINDOW, Estimate, Reason, State
+from gz_onboard.events import WINDOW, Estimate, Explanation, Reason, State
 from gz_onboard.lab.estimate_ride import Ridden
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
-from gz_onboard.lab.why import Why, why_of
 from gz_onboard.pipeline import lacking
 from gz_onboard.reports.results import leap_text, times, to_json
 from gz_onboard.vehicle import Vehicle
@@ -23,6 +22,25 @@ GAINS = (0.6, 1.7)  # of a state of charge counted over what the vehicle shows: 
 AGED = 0.85  # likewise: packs that count less are rare
 SHOWN_SD = 0.06  # of a vehicle's own state of charge
 MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
+
+
+@dataclass(frozen=True)
+class Why:
+    """A range against another, split among causes (docs/explanation/causes.md)."""
+
+    time_s: Annotated[float, "since the first frame"]
+    reference_km: Annotated[float, "the rated range; of a change, the range before"]
+    range_km: Annotated[float, "the range then; of a change, with the distance ridden since"]
+    causes_km: Annotated[dict[str, float], "the share of each cause in the difference; the shares add up to it"]
+    forgotten: Annotated[list[str], "roles of sensors found faulty between, whose lessons are forgotten"] = field(
+        default_factory=list
+    )
+
+
+def why_of(e: Explanation) -> Why:
+    """An explanation in km."""
+    causes = {cause.name.lower(): size * 1e-3 for cause, size in e.causes.items()}
+    return Why(e.time, e.reference * 1e-3, e.range * 1e-3, causes, list(e.forgotten))
 
 
 @dataclass(frozen=True)

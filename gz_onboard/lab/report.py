@@ -3,32 +3,101 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import html
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
+from gz_onboard.constants import WH
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
-from gz_onboard.lab.estimate import expected_frames
-from gz_onboard.lab.estimate_ride import known_vehicle
-from gz_onboard.lab.report_page import cells, contents, section
-from gz_onboard.lab.report_ride import ReportedRide, ReportTask, read_report
+from gz_onboard.estimator.load_model import Ledger
+from gz_onboard.estimator.signals import FIX_2D
+from gz_onboard.events import TOLD, cause_words, words
+from gz_onboard.lab.estimate import expected_frames, lacks_energy, summary_rows
+from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through, vehicle_of
+from gz_onboard.lab.estimate_summary import RideSummary, Why, summary_of
+from gz_onboard.lab.kept_rows import KeptRows
+from gz_onboard.log_rows import ESTIMATE_TOPIC
+from gz_onboard.offline.arrays import held_at
 from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.processes import collect, over_rides
-from gz_onboard.offline.samples import ride_name
+from gz_onboard.offline.processes import Task, collect, over_rides
+from gz_onboard.offline.samples import Samples, read_samples, ride_name
+from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
-from gz_onboard.reports.page import page
-from gz_onboard.vehicle import find_vehicle
+from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance
+from gz_onboard.reports.page import drawn, html_table, page, tiles
+from gz_onboard.reports.results import FIRST_DATE_NS, clock, number
+from gz_onboard.routes.route import read_route
+from gz_onboard.vehicle import Vehicle, find_vehicle
+
+LEAST_WH = 0.05
+"""Smaller entries of the ledger are left out."""
+LONGEST_GAP_S = 10.0
+"""Samples further apart have a hole between them."""
+MOST_CHANGES = 20
+TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")
+"""Causes that a sensor which is left out may have taught."""
+
+Position = tuple[float, float]
+"""Latitude and longitude [deg]."""
+
+
+@dataclass(frozen=True)
+class ReportTask(Task):
+    """A log for the page. located: whether the page shows where the ride was."""
+
+    route: Path | None = None
+    located: bool = True
+
+
+@dataclass(frozen=True)
+class ReportedRide:
+    """A ride. rows: its estimates, one a second; ledger: of the riding that the forecast learned from;
+    path: the positions, a sequence between two holes each; temperatures: by role [degC].
+    """
+
+    name: str
+    summary: RideSummary
+    rows: Sequence[Row]
+    ledger: Ledger
+    path: list[list[Position]]
+    temperatures: dict[str, Series]
+
+    @property
+    def ledger_km(self) -> float:
+        """The distance that the ledger is of, like the energy."""
+        return self.summary.energy_distance_km or self.summary.distance_km
+
+    def ledger_wh(self) -> dict[str, float]:
+        """Split the energy [Wh] by effect, the largest first; negative entries gave energy.
+
+        ``beyond the model``: measured less modelled; ``not modelled``: drawn while nothing was learned, as while
+        charging, standing long or with a sensor in doubt.
+        """
+        drawn_wh, modelled = self.summary.energy_wh, self.ledger.modelled
+        entries = {words(name): joule / WH for name, joule in modelled.items()}
+        if entries:
+            entries["beyond the model"] = (self.ledger.measured - sum(modelled.values())) / WH
+        if entries and drawn_wh is not None:
+            entries["not modelled"] = drawn_wh - self.ledger.measured / WH
+        return dict(sorted(entries.items(), key=lambda entry: -entry[1]))
 
 
 @dataclass(frozen=True)
 class RideSection:
-    """A ride in the page. cells: of the table of all rides; html: its section."""
+    """A ride in the page. cells: its row in the table of all rides, the name first; html: its section."""
 
     anchor: str
     cells: list[str]
     html: str
     damage: str | None
+
+
+# --- the command --------------------------------------------------------------------------------------------------
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     more = {"route": arguments.route, "located": not arguments.no_path}
     tasks = [ReportTask(log, Path(f"ride-{i}"), *given, **more) for i, log in enumerate(logs, 1)]
     with progress_bar(lambda: expected_frames(logs), "frames", quiet=arguments.quiet) as display:
-        results = over_rides(ride_section, tasks, arguments.jobs, display.update)
+        results = over_rides(_section_of_log, tasks, arguments.jobs, display.update)
         found, failed = collect("report", results, display, None, lambda ride: ride.damage)
     if found:
         with writing(out):
@@ -63,25 +132,224 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def check_page(out: Path) -> None:
-    """InputError for a page that cannot be, before anything takes long."""
+    """InputError for a page that cannot be written, before the rides are read."""
     if out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out}: the report is a page in HTML; give it a name that ends in .html")
     if not out.parent.is_dir():
         raise InputError(f"{out}: cannot be written: there is no folder {out.parent}; make it")
 
 
-def ride_section(task: ReportTask, progress: Progress | None = None) -> RideSection:
+def _section_of_log(task: ReportTask, progress: Progress | None = None) -> RideSection:
     """The section of the page for one log. Raises InputError."""
-    return section_of(read_report(task, progress), task.stem.name)
+    return section_of(report_of(task.path, vehicle_of(task), task.route, task.located, progress), task.stem.name)
+
+
+# --- the ride -----------------------------------------------------------------------------------------------------
+
+
+def report_of(
+    source: Path | SignalTable,
+    vehicle: Vehicle,
+    route: Path | None = None,
+    located: bool = True,
+    progress: Progress | None = None,
+) -> ReportedRide:
+    """Estimate a ride as the daemon would, with its ledger, path and temperatures. Raises InputError."""
+    road = read_route(route) if route else None
+    log = KeptRows()
+    ridden = ride_through(open_estimate(source, vehicle), How(route=road, ledger=True), log, progress)
+    samples = read_samples(source, vehicle)
+    return ReportedRide(
+        samples.name,
+        summary_of(ridden),
+        [dict(row) for row in log.of(ESTIMATE_TOPIC)],
+        ridden.pipeline.estimator.forecaster.load.ledger or Ledger(),
+        path_of(samples) if located else [],
+        {role: _series(samples, role) for role in TEMPERATURE_COLOURS if role in samples.columns},
+    )
+
+
+def _series(samples: Samples, role: str) -> Series:
+    """The samples of a role, with a NaN in each hole, through which no line is drawn."""
+    times, values = samples.columns[role]
+    holes = np.flatnonzero(np.diff(times) > LONGEST_GAP_S) + 1
+    return np.insert(times, holes, times[holes]).tolist(), np.insert(values, holes, np.nan).tolist()
+
+
+def path_of(samples: Samples) -> list[list[Position]]:
+    """The positions by a receiver with a fix, split at holes; empty with fewer than two."""
+    if not {"latitude", "longitude"} <= samples.columns.keys():
+        return []
+    times, latitude = samples.columns["latitude"]
+    longitude = held_at(times, *samples.columns["longitude"])
+    seen = times >= samples.columns["longitude"][0][0]
+    if "gps_fix" in samples.columns:
+        seen &= held_at(times, *samples.columns["gps_fix"]) >= FIX_2D
+    places = np.column_stack([latitude, longitude])[seen]
+    runs = np.split(places, np.flatnonzero(np.diff(times[seen]) > LONGEST_GAP_S) + 1)
+    return [[(a, b) for a, b in run.tolist()] for run in runs if len(run) > 1]
+
+
+# --- the page -----------------------------------------------------------------------------------------------------
+
+
+def page_of(rides: Sequence[RideSection]) -> str:
+    """The page of all rides in their order; several have a table of contents."""
+    if len(rides) == 1:
+        return page(rides[0].cells[0], [rides[0].html])
+    heads = ("ride", "start", "time", "km", "Wh/km", "SOC", "range left, km")
+    lines = [
+        f'<tr><td><a href="#{ride.anchor}">{html.escape(ride.cells[0])}</a></td>'
+        + "".join(f'<td class="n">{cell}</td>' for cell in ride.cells[1:])
+        for ride in rides
+    ]
+    head = "".join(f"<th{' class=n' if i else ''}>{text}</th>" for i, text in enumerate(heads))
+    title = f"{len(rides)} rides"
+    contents = f'<div class="scroll"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+    return page(title, [f"<h1>{title}</h1>", contents, *(ride.html for ride in rides)])
 
 
 def section_of(ride: ReportedRide, anchor: str) -> RideSection:
     """The section of a ride; anchor: its id in the page."""
-    return RideSection(anchor, cells(ride), section(ride, anchor), ride.summary.damage)
+    s = ride.summary
+    # The page may be sent to somebody, whom our folders do not concern.
+    damage = [f"damaged log: {s.damage.replace(s.file, '').lstrip(': ')}"] if s.damage else []
+    about = " · ".join([s.vehicle, _start(s.start_ns), Path(s.file).name, *damage])
+    parts = [
+        f'<h2>{html.escape(ride.name)}</h2><p class="about">{html.escape(about)}</p>',
+        _tiles(ride),
+        f"<h3>Path</h3>{drawn(path_map(ride.path), 'the path, north up')}" if ride.path else "",
+        *(_charts(ride) if ride.rows else []),
+        _ledger(ride),
+        _why(s.why),
+        _changes(s.changes),
+        f'<h3>Summary</h3><div class="summary">{html_table(("", ""), summary_rows(s))}</div>',
+    ]
+    text = f'<section class="ride" id="{anchor}">' + "\n".join(filter(None, parts)) + "</section>"
+    numbers = [number(s.distance_km, ".2f"), number(s.consumption_wh_km, ".1f"), _soc(s), number(s.range_end_km, ".1f")]
+    return RideSection(anchor, [ride.name, _start(s.start_ns), clock(s.duration_s), *numbers], text, s.damage)
 
 
-def page_of(rides: Sequence[RideSection]) -> str:
-    """The page of all rides, in their order; of several with a table above."""
-    title = rides[0].cells[0] if len(rides) == 1 else f"{len(rides)} rides"
-    head = [] if len(rides) == 1 else [f"<h1>{title}</h1>", contents([(ride.anchor, ride.cells) for ride in rides])]
-    return page(title, [*head, *(ride.html for ride in rides)])
+def _start(start_ns: int) -> str:
+    if start_ns < FIRST_DATE_NS:
+        return "–"
+    return datetime.fromtimestamp(start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _soc(s: RideSummary) -> str:
+    return f"{number(s.soc_start, '.1f', '', 100)} → {number(s.soc_end, '.1f', '%', 100)}"
+
+
+def _tiles(ride: ReportedRide) -> str:
+    s = ride.summary
+    band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
+    missing = lacks_energy(s)
+    over = f"over {s.energy_distance_km:.2f} km: {missing}" if missing else "over the ride"
+    return tiles(
+        [
+            ("distance", number(s.distance_km, ".2f", "km"), f"in {clock(s.duration_s)}"),
+            (
+                "energy",
+                number(s.energy_wh, ".0f", "Wh"),
+                f"drawn, {number(s.energy_recovered_wh, '.0f', 'Wh')} recovered",
+            ),
+            ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), over),
+            ("soc", _soc(s), f"state of charge, ± {number(s.soc_end_sd, '.1f', '%', 100)}"),
+            ("range", number(s.range_end_km, ".1f", "km"), band),
+        ]
+    )
+
+
+def _charts(ride: ReportedRide) -> Iterable[str]:
+    """The range against its outcome, and the overview."""
+    known = [row for row in ride.rows if row["range"] is not None]
+    if known:
+        yield f"<h3>Range over the distance</h3>{drawn(range_over_distance(ride.rows), 'range over the distance')}"
+        first, last = (
+            f"{row['range'] / 1e3:.1f} km ({row['range_p10'] / 1e3:.1f} to {row['range_p90'] / 1e3:.1f})"
+            for row in (known[0], known[-1])
+        )
+        text = f"At first it said {first}, and {(known[-1]['distance'] - known[0]['distance']) / 1e3:.2f} km later"
+        yield f'<p class="note" data-of="forecast">{text} {last}.</p>'
+    figure = overview(ride.rows, temperatures=ride.temperatures)
+    yield f"<h3>Over time</h3>{drawn(figure, 'range, charge, pack, motion, consumption, temperatures and state')}"
+
+
+def _bar(begin: float, end: float, low: float, high: float, colour: str) -> str:
+    """A cell of a table with a bar from `begin` to `end` on an axis from `low` to `high`."""
+    scale = 100 / (high - low or 1.0)
+    left, width = (min(begin, end) - low) * scale, abs(end - begin) * scale
+    return f'<td class="bar"><i class="{colour}" style="margin-left:{left:.1f}%;width:{width:.1f}%"></i></td>'
+
+
+def _ledger(ride: ReportedRide) -> str:
+    """The energy by effect of the model, and the rest of the measured energy."""
+    drawn_wh, distance = ride.summary.energy_wh, ride.ledger_km
+    entries = [(name, energy) for name, energy in ride.ledger_wh().items() if abs(energy) >= LEAST_WH]
+    if not entries:
+        return ""
+    low, high = min(0.0, *(e for _, e in entries)), max(0.0, *(e for _, e in entries))
+
+    def row(name: str, bar: str, energy: float) -> str:
+        per_km = f"{energy / distance:z.1f}" if distance >= 0.1 else "–"
+        return f'<tr><td>{name}</td>{bar}<td class="n">{energy:z.1f}</td><td class="n">{per_km}</td></tr>'
+
+    lines = [row(html.escape(name), _bar(0.0, e, low, high, "blue" if e > 0 else "green"), e) for name, e in entries]
+    if drawn_wh is not None:
+        lines.append(row("drawn from the pack", "<td></td>", drawn_wh))
+    return (
+        "<h3>Where the energy went</h3><p class=note>By the model, second by second. Beyond the model: measured less "
+        "modelled. Not modelled: drawn while nothing was learned, as while charging, standing long or with a sensor in "
+        f'doubt. Negative: gained.</p><table class="{"" if drawn_wh is None else "total"}" data-of="ledger">'
+        f"<tr><th></th><th></th><th class=n>Wh</th><th class=n>Wh/km</th></tr>{''.join(lines)}</table>"
+    )
+
+
+def _largest(causes: dict[str, float]) -> list[tuple[str, float]]:
+    """The causes [km] that are worth showing, the largest first."""
+    return sorted(((n, km) for n, km in causes.items() if abs(km) * 1e3 >= TOLD), key=lambda cause: -abs(cause[1]))
+
+
+def _why(why: Why | None) -> str:
+    """From the rated range to that at the end, cause by cause."""
+    if why is None:
+        return ""
+    steps = [("rated range", 0.0, why.reference_km, "grey", "")]
+    for name, size in _largest(why.causes_km):
+        reached = steps[-1][2]
+        steps.append((cause_words(name), reached, reached + size, "green" if size > 0 else "red", "+"))
+    steps.append(("range", 0.0, why.range_km, "blue", ""))
+    high = max(end for _, _, end, _, _ in steps)
+    low = min(0.0, *(end for _, _, end, _, _ in steps))
+    lines = [
+        f"<tr><td>{html.escape(name)}</td>{_bar(begin, end, low, high, colour)}"
+        f"<td class=n>{end - begin:{sign}.1f}</td></tr>"
+        for name, begin, end, colour, sign in steps
+    ]
+    return (
+        f"<h3>Why the range is not the rated one</h3><p class=note>At {clock(why.time_s)}, in km; causes below "
+        f'{TOLD:.0f} m are left out.</p><table data-of="why">{"".join(lines)}</table>'
+    )
+
+
+def changed_by(change: Why) -> dict[str, float]:
+    """The causes of a change [km], in words; a sensor that is left out takes with it what it taught."""
+    causes = {cause_words(name): km for name, km in change.causes_km.items()}
+    if change.forgotten:
+        left_out = " and ".join(map(words, change.forgotten))
+        taught = sum(causes.pop(cause_words(name), 0.0) for name in TAUGHT)
+        causes[f"{left_out} left out, what it taught forgotten"] = taught
+    return causes
+
+
+def _changes(changes: Sequence[Why]) -> str:
+    """Each change of the range beyond the distance ridden, and its causes."""
+    if not changes:
+        return ""
+    rows = []
+    for change in changes[-MOST_CHANGES:]:
+        causes = ", ".join(f"{name} {km:+.1f}" for name, km in _largest(changed_by(change)))
+        rows.append([clock(change.time_s), f"{change.range_km - change.reference_km:+.1f}", causes])
+    more = f"; the last {MOST_CHANGES} of {len(changes)}" if len(changes) > MOST_CHANGES else ""
+    title = f"<h3>Changes of the range, in km, beyond what was ridden{more}</h3>"
+    return f'{title}<div data-of="changes">{html_table(("at", "by", "why"), rows, (1,))}</div>'

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,32 +29,16 @@ body { font: 1rem/1.4 system-ui, sans-serif; color: var(--ink); background: var(
  margin: 0 auto; padding: 0 1rem 3rem; overflow-wrap: break-word; }
 h1 { font-size: 1.5rem; margin: 1.2rem 0 .3rem; } h2 { font-size: 1.3rem; margin: 2rem 0 .2rem; }
 h3 { font-size: 1rem; margin: 1.8rem 0 .3rem; } p { margin: .3rem 0; } a { color: var(--blue); }
-.about, .note, .unit, figcaption span { color: var(--muted); font-size: .85rem; }
+.about, .note { color: var(--muted); font-size: .85rem; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .6rem; margin: .8rem 0; }
 .tiles div { background: var(--card); border-radius: .5rem; padding: .5rem .7rem; }
 .tiles b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
 .tiles span { color: var(--muted); font-size: .8rem; }
-figure { margin: 1.6rem 0 0; } figcaption b { margin-right: .3rem; }
-.key { margin-left: .8rem; white-space: nowrap; }
-.key i { display: inline-block; width: .9rem; height: .25rem; margin-right: .3rem; vertical-align: middle;
- background: currentColor; }
-.plot { position: relative; height: 9rem; margin: .6rem 1.4rem 2rem 2.6rem; }
-.plot svg, .strip svg, .bar svg { position: absolute; left: 0; width: 100%; height: 100%; overflow: visible; }
-.plot span { position: absolute; font-size: .75rem; color: var(--muted); line-height: 1; white-space: nowrap; }
-.plot .y { right: 100%; margin-right: .35rem; transform: translateY(-50%); }
-.plot .x { top: 100%; margin-top: .35rem; transform: translateX(-50%); }
-svg path { fill: none; stroke: currentColor; stroke-width: 1.4; vector-effect: non-scaling-stroke;
- stroke-linejoin: round; stroke-linecap: round; }
-path.grid { stroke: var(--grid); stroke-width: 1; } path.band { fill: currentColor; stroke: none; opacity: .2; }
-path.box { fill: currentColor; stroke: none; } path.dashed { stroke-dasharray: 5 4; stroke: var(--muted); }
-path.way { stroke-width: 3; } path.dot { stroke-width: 12; } path.bar { stroke-width: 3; stroke: var(--ink); }
-.map { display: block; width: 100%; max-height: 34rem; background: var(--card); border-radius: .5rem; }
-.strip { margin: .5rem 1.4rem 0 2.6rem; font-size: .85rem; } .strip div { position: relative; height: .8rem; }
-.strip div { background: var(--card); }
+figure { margin: 1.6rem 0 0; }
 table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-numeric: tabular-nums; }
 td, th { padding: .25rem .5rem .25rem 0; border-bottom: 1px solid var(--grid); text-align: left; vertical-align: top; }
 th { font-weight: 600; } .n { text-align: right; white-space: nowrap; } .summary td:first-child { width: 8.5rem; }
-td.bar { width: 40%; position: relative; } td.bar svg { top: 15%; height: 70%; }
+td.bar { width: 40%; } td.bar i { display: block; height: .8rem; background: currentColor; min-width: 1px; }
 .total tr:last-child { font-weight: 600; } .at { white-space: nowrap; } .scroll { overflow-x: auto; }
 .blue { color: var(--blue); } .orange { color: var(--orange); } .green { color: var(--green); }
 .red { color: var(--red); } .purple { color: var(--purple); } .grey { color: var(--grey); }
@@ -63,11 +48,13 @@ td.bar { width: 40%; position: relative; } td.bar svg { top: 15%; height: 70%; }
 pre { background: var(--card); border-radius: .5rem; padding: .8rem; overflow-x: auto; }
 summary { cursor: pointer; padding: .3rem 0; font-weight: 600; } nav a { margin-right: .8rem; }
 .wide table { min-width: 38rem; }
-.drawn { display: block; max-width: 100%; height: auto; } .scroll .drawn { max-width: none; }
+.drawn { display: block; width: 100%; height: auto; } .scroll .drawn { min-width: 38rem; }
 .panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(19rem, 100%), 1fr)); gap: 0 1rem; }
 @media (prefers-color-scheme: dark) { .drawn { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; } }
 @media print { figure, table { break-inside: avoid; } }
 """
+WIDE_INCHES = 8.0
+"""A wider figure is scrolled on a phone, or its texts could not be read."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """What a browser may fetch for the page: nothing."""
 
@@ -152,15 +139,15 @@ def mark_of(maker: str) -> str:
     return f"<!-- made by {maker} from here on -->"
 
 
-def drawn(figure: Figure, label: str, colours: int = 20) -> str:
-    """A figure inside a page, small, the same bytes for the same figure; label: for those who cannot see it."""
-    from PIL import Image
-
-    png, webp = io.BytesIO(), io.BytesIO()
-    write(figure, png, "png", dpi=72)
-    few = Image.open(png).convert("RGB").quantize(colours, dither=Image.Dither.NONE)
-    few.save(webp, "webp", lossless=True, quality=100, method=6)
-    return embedded(webp.getvalue(), "webp", label)
+def drawn(figure: Figure, label: str) -> str:
+    """A figure inside a page as SVG, the same text for the same figure; label: for those who cannot see it."""
+    picture = io.BytesIO()
+    write(figure, picture, "svg")
+    svg = re.sub(r"<metadata>.*?</metadata>", "", picture.getvalue().decode("utf-8"), flags=re.DOTALL)
+    svg = re.sub(r"(?<=\.\d\d)\d+", "", svg[svg.index("<svg") :])  # a hundredth of a point cannot be seen
+    head = f'<svg class="drawn" role="img" aria-label="{html.escape(label)}" '
+    shown = head + svg.removeprefix("<svg ")
+    return f'<div class="scroll">{shown}</div>' if figure.get_figwidth() > WIDE_INCHES else shown
 
 
 def image(file: Path) -> str:
@@ -168,10 +155,5 @@ def image(file: Path) -> str:
     kind = picture_format(file)
     if kind == "pdf":
         return f"<a href='{html.escape(quote(file.name))}'>{html.escape(writable(file.name))}</a>"
-    return embedded(file.read_bytes(), "svg+xml" if kind == "svg" else kind)
-
-
-def embedded(picture: bytes, kind: str, label: str = "") -> str:
-    """A picture inside a page."""
-    data = base64.b64encode(picture).decode("ascii")
-    return f'<img class="drawn" alt="{html.escape(label)}" src="data:image/{kind};base64,{data}">'
+    data = base64.b64encode(file.read_bytes()).decode("ascii")
+    return f'<img class="drawn" alt="" src="data:image/{"svg+xml" if kind == "svg" else kind};base64,{data}">'

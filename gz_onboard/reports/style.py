@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, writable
 from gz_onboard.options import PICTURE_FORMATS
 
@@ -134,7 +135,7 @@ def legend(axis: Axes, *others: Axes) -> None:
     )
 
 
-def close(axes: Sequence[Axes], x: Sequence[float], text: str) -> None:
+def close(axes: Sequence[Axes], x: Sequence[float] | Array, text: str) -> None:
     """The abscissa `x` of a stack: named and numbered below the last panel only, from end to end."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -67,19 +67,6 @@ def table(page: Page, of: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in rows}
 
 
-CURVES = """figures => Object.fromEntries(figures.map(figure => [figure.querySelector("b").innerText, {
-  lines: [...figure.querySelectorAll("path.line")].map(path => path.getAttribute("d")),
-  ticks: [...figure.querySelectorAll("span.y")].map(tick => [parseFloat(tick.style.top), parseFloat(tick.innerText)])
-}]))"""
-
-
-def heights(drawn: Any) -> list[float]:
-    """The values of the first line of a chart, by its own ordinate."""
-    (y0, v0), (y1, v1) = drawn["ticks"][0], drawn["ticks"][-1]
-    found = [float(y) / 10 for y in re.findall(r"[ML][-\d]+ (-?\d+)", drawn["lines"][0])]
-    return [v0 + (y - y0) * (v1 - v0) / (y1 - y0) for y in found]
-
-
 def test_the_page_says_what_the_estimates_say(shown: Page, estimated: EstimatedRide):
     s, rows = estimated.summary, [row for row in estimated.estimates.rows if row["range"] is not None]
     assert s.energy_wh is not None
@@ -94,23 +81,6 @@ def test_the_page_says_what_the_estimates_say(shown: Page, estimated: EstimatedR
     assert said == [tuple(f"{1e-3 * float(str(row[n])):.1f}" for n in names) for row in (rows[0], rows[-1])]
     assert "part of <a> ride" in shown.inner_text("h2")
     assert str(s.frames) in shown.inner_text(".summary")
-
-
-def test_the_curves_are_those_of_the_estimates(shown: Page, estimated: EstimatedRide):
-    drawn: Any = shown.eval_on_selector_all("figure:has(.plot)", CURVES)
-    table = estimated.to_table()
-    power = table["pack_voltage[V]"] * table["pack_current[A]"] * 1e-3
-    for title, values, precise in (
-        ("Speed", table["speed[m/s]"] * 3.6, 0.1),
-        ("Power of the pack", power, 0.01),
-        ("State of charge", table["soc"] * 100, 0.02),
-        ("Range over the distance", table["range[m]"] * 1e-3, 0.03),
-    ):
-        known = values[values == values]
-        found = heights(drawn[title])
-        assert min(found) == pytest.approx(known.min(), abs=precise), title
-        assert max(found) == pytest.approx(known.max(), abs=precise), title
-        assert found[-1] == pytest.approx(known[-1], abs=precise), title
 
 
 def test_the_ledger_adds_up_to_what_was_drawn(shown: Page, estimated: EstimatedRide):
@@ -136,14 +106,11 @@ def test_it_fits_its_screen(shown: Page, size: tuple[int, int]):
     shown.set_viewport_size({"width": size[0], "height": size[1]})
     assert shown.evaluate("document.documentElement.scrollWidth") == size[0]
     smallest = (
-        "Math.min(...[...document.querySelectorAll('span, td')].map(e => parseFloat(getComputedStyle(e).fontSize)))"
+        "Math.min(...[...document.querySelectorAll('p, span, td')].map(e => parseFloat(getComputedStyle(e).fontSize)))"
     )
     assert shown.evaluate(smallest) >= 12
-    box = shown.locator("svg.map").bounding_box()
-    assert box is not None
-    assert 100 < box["height"] <= size[1]
-    wide = "[...document.querySelectorAll('.plot svg')].map(e => e.getBoundingClientRect().width)"
-    assert min(shown.evaluate(wide)) > 0.6 * min(size[0], 992)
+    wide = "[...document.querySelectorAll('svg.drawn')].map(e => e.getBoundingClientRect().width)"
+    assert min(shown.evaluate(wide)) >= 600  # scrolled on a phone, so that its texts can be read
 
 
 def test_light_and_dark(shown: Page):
@@ -154,4 +121,4 @@ def test_light_and_dark(shown: Page):
 
 
 def test_nothing_in_it_can_be_fetched(file: Path):
-    assert not re.search(r"""<(script|link|img|iframe)|\b(src|href)=["']?(?!#)|url\(|@import""", file.read_text())
+    assert not re.search(r"""<(script|link|img|iframe)|\b(src|href)=(?!["']?#)|url\((?!#)|@import""", file.read_text())
