@@ -144,7 +144,7 @@ def drawn(figure: Figure, label: str) -> str:
     picture = io.BytesIO()
     write(figure, picture, "svg")
     svg = re.sub(r"<metadata>.*?</metadata>", "", picture.getvalue().decode("utf-8"), flags=re.DOTALL)
-    svg = re.sub(r"(?<=\.\d\d)\d+", "", svg[svg.index("<svg") :])  # a hundredth of a point cannot be seen
+    svg = re.sub(r"(?<=\.\d)\d+(?= )", "", svg[svg.index("<svg") :])  # a tenth of a point cannot be seen
     head = f'<svg class="drawn" role="img" aria-label="{html.escape(label)}" '
     shown = head + svg.removeprefix("<svg ")
     return f'<div class="scroll">{shown}</div>' if figure.get_figwidth() > WIDE_INCHES else shown

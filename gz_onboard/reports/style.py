@@ -36,6 +36,7 @@ _METADATA: dict[str, dict[str, Any]] = {
     "pdf": {"Creator": "gz-onboard", "CreationDate": None},
 }
 _TEXT_AS_TEXT: Any = {
+    "path.simplify_threshold": 0.5,
     "svg.fonttype": "none",
     "svg.hashsalt": "gz-onboard",
     "pdf.fonttype": 42,
