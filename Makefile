@@ -8,7 +8,7 @@ VALIDATED := $(addprefix replay_logs/,calibration/ride_000.blf turning/city_11C.
     calibration/ride_004.blf turning/oval_2C.blf calibration/ride_006.blf calibration/ride_007.blf city_34C.blf \
     validation/dyno_00.blf calibration/dyno_02.blf)
 
-.PHONY: help setup run test lint format docs man deb deb-clean-root bench trial range-benchmark validation hardening clean
+.PHONY: help setup run test lint format docs man deb deb-clean-root bench trial range-benchmark validation hardening mutants clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -66,6 +66,9 @@ validation: setup  ## the recorded rides of the repository against their simulat
 
 hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/results/reliability.md
 	$(PYTHON_IN_VENV) -m tests.hardening
+
+mutants: setup  ## 300 wrong lines, one at a time: do the tests notice each? (25 minutes)
+	$(PYTHON_IN_VENV) -m tests.mutants
 
 clean:  ## remove what the other targets made, except runs/
 	rm -rf .venv build dist docs/api docs/generated tests/display/foxglove_npm/node_modules .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
