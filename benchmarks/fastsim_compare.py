@@ -11,7 +11,6 @@ own losses   the scooter's own losses in watts over speed and current; FASTSim w
 from __future__ import annotations
 
 import time
-from collections.abc import MutableMapping
 from dataclasses import replace
 from typing import Any
 
@@ -41,22 +40,16 @@ class EfficiencyMotor:
     When it brakes, FASTSim 3.1 takes the first efficiency of the table at any power, and so does this.
     """
 
-    def __init__(self, torque_constant: float, voltage_constant: float) -> None:
-        self.torque_constant = torque_constant
-        self.voltage_constant = voltage_constant
+    name = "motor"
 
-    def heat(
-        self, speed: float, current: float, temperature: float, dt: float, ledger: MutableMapping[str, float]
-    ) -> float:
+    def __init__(self, torque_constant: float) -> None:
+        self.torque_constant = torque_constant
+
+    def loss(self, speed: float, current: float, temperature: float) -> float:
         power = self.torque_constant * current * speed
         share = min(max(power, 0.0) / POWER, 1.0)
         efficiency = PiecewiseLinear(SHARES, EFFICIENCY).at(share)
-        loss = power / efficiency - power if power >= 0 else power * efficiency - power
-        ledger["motor"] += loss * dt
-        return loss
-
-    def idle(self, speed: float, temperature: float) -> float:
-        return 0.0
+        return power / efficiency - power if power >= 0 else power * efficiency - power
 
 
 class EfficiencyPack:
@@ -195,11 +188,10 @@ def unlimited(scooter: Scooter) -> Scooter:
 
 def same_parts(vehicle: Vehicle) -> Scooter:
     """The scooter with FASTSim's motor and pack, its motor doing all the braking."""
-    p = vehicle.parameters
     bare = electric_braking(
         vehicle, inverter_loss_constant=0.0, inverter_loss_linear=0.0, inverter_loss_quadratic=0.0, bms_resistance=0.0
     )
-    motor = EfficiencyMotor(p["torque_constant"], p["voltage_constant"])
+    motor = EfficiencyMotor(vehicle.parameters["torque_constant"])
     pack = EfficiencyPack(capacity(vehicle), 51.8)
     return unlimited(Scooter(bare, ambient=AMBIENT, altitude=ALTITUDE, soc=0.9, motor=motor, pack=pack))
 

@@ -18,7 +18,7 @@ from gz_onboard.model.battery import Battery
 from gz_onboard.model.drawable import drawable
 from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.offline.series import ocv_over
-from gz_onboard.simulation.parts.battery import FirstOrderPack
+from gz_onboard.simulation.parts import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import OWN, read_vehicle

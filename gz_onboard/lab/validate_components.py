@@ -35,7 +35,7 @@ from gz_onboard.offline.series import (
     terminal_voltage,
     total,
 )
-from gz_onboard.simulation.parts.road import Dynamometer
+from gz_onboard.simulation.parts import Dynamometer
 from gz_onboard.vehicle import Vehicle
 
 

@@ -5,7 +5,10 @@ Lags, tables and effects give here the values (n,) that their scalar forms in ``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -14,9 +17,10 @@ from numpy.typing import ArrayLike
 from gz_onboard.arrays import Array
 from gz_onboard.model.battery import HALF_FULL, Battery, discharged, reversible_heat
 from gz_onboard.model.effect import QUANTITIES, Equation, Port
-from gz_onboard.model.functions import Mesh, PiecewiseLinear, exp, sqrt
+from gz_onboard.model.functions import Mesh, PiecewiseLinear, asinh, cos, exp, sin, sqrt
 from gz_onboard.model.model import STOOD, Bound, Model, Recall
 
+OF_FLOATS = {exp: math.exp, sin: math.sin, cos: math.cos, sqrt: math.sqrt, asinh: math.asinh}
 NEGLIGIBLE = 1e-20  # share of a value that is too small to change it in floating point
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
@@ -107,38 +111,46 @@ def over(dt: Any) -> Recall:
     return lambda effect, quantities: series(effect, dt, quantities)
 
 
-def stepper(effects: Sequence[Bound], dt: float | None, booked: bool = False) -> Callable[..., Any]:
-    """A function from quantities to the tuple of the values of `effects`, to be called once each step of `dt` [s].
+def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """Return a function from quantities to the values of `effects`, to be called once each step of `dt` [s].
 
-    booked: it takes a ledger too, adds each value times `dt` to it by the name of the effect, and gives their sum.
-    Effects with memory start from 0; without `dt` they are settled. The function is written out as source, without
-    loops and layers of calls: a simulation calls it a hundred times for each second ridden.
+    Effects with memory start from 0; without `dt` they are settled. The function is compiled from source, without loops
+    and layers of calls: a simulation calls it a hundred times for each second ridden.
     """
     scope: dict[str, Any] = {"dt": dt}
     lines = []
     for i, bound in enumerate(effects):
-        decay = bound.effect.decay
         call = _call(bound.effect.term, bound.values, f"term{i}", scope)
-        if decay and dt is not None:
-            scope[f"value{i}"], kept = 0.0, _call(decay, bound.values, f"decay{i}", scope)
+        if bound.effect.decay and dt is not None:
+            scope[f"value{i}"], kept = 0.0, _call(bound.effect.decay, bound.values, f"decay{i}", scope)
             if bound.has_fixed_time:
                 scope[f"kept{i}"], kept = bound.decay(dt, {}), f"kept{i}"
-            lines += [f"global value{i}", f"k = {kept}"]
-            call = f"k * value{i} + (1 - k) * {call}"
-        lines.append(f"value{i} = {call}")
-        if booked:
-            lines.append(f"ledger[{bound.effect.name!r}] += value{i} * dt")
-    values = [f"value{i}" for i in range(len(effects))]
-    result = " + ".join(values) or "0.0" if booked else f"({''.join(f'{value}, ' for value in values)})"
-    exec("\n    ".join([f"def values({'q, ledger' if booked else 'q'}):", *lines, f"return {result}"]), scope)
+            lines += [f"global value{i}", f"k = {kept}", f"value{i} = k * value{i} + (1 - k) * {call}"]
+            call = f"value{i}"
+        lines.append(f"x{i} = {call}")
+    values = "".join(f"x{i}, " for i in range(len(effects)))
+    exec("\n    ".join(["def values(q):", *lines, f"return ({values})"]), scope)
     return scope["values"]  # type: ignore[no-any-return]
 
 
 def _call(equation: Equation, values: Mapping[str, float], label: str, scope: dict[str, Any]) -> str:
-    """Source of a call of `equation` with quantities from ``q`` and with ``dt``; what it names is added to `scope`."""
-    scope |= {label: equation.function} | {f"{label}_{name}": values[name] for name in equation.parameters}
-    quantities = [name if name == "dt" else f"q[{name!r}]" for name in equation.quantities]
-    return f"{label}({', '.join([*quantities, *(f'{name}={label}_{name}' for name in equation.parameters)])})"
+    """Source of a call of `equation` as `label`, with quantities from ``q`` and with ``dt``; adds it to `scope`."""
+    scope[label] = _with_values(equation, values)
+    return f"{label}({', '.join(name if name == 'dt' else f'q[{name!r}]' for name in equation.quantities)})"
+
+
+def _with_values(equation: Equation, values: Mapping[str, float]) -> Callable[..., Any]:
+    """The function of `equation` with its parameters as defaults: the quickest call that Python has."""
+    function, given = equation.function, [values[name] for name in equation.parameters]
+    if not isinstance(function, FunctionType) or function.__defaults__:
+        return partial(function, **dict(zip(equation.parameters, given, strict=True)))
+    scope = {
+        name: OF_FLOATS.get(value, value) if isinstance(value, FunctionType) else value
+        for name, value in function.__globals__.items()
+    }
+    code = function.__code__  # in which arguments by keyword follow those by position
+    code = code.replace(co_argcount=code.co_argcount + len(given), co_kwonlyargcount=0)
+    return FunctionType(code, scope, function.__name__, tuple(given), function.__closure__)
 
 
 def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:

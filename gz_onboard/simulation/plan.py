@@ -13,11 +13,11 @@ from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.routes.route import Route, read_route, speed_profile
 from gz_onboard.simulation.cycles import find_cycle
-from gz_onboard.simulation.parts.chassis import MODELS
-from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
+from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table, straight
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
-from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
+from gz_onboard.simulation.run import Command, along, at_steps, follow, replay
 from gz_onboard.simulation.scooter import STEP
+from gz_onboard.simulation.turning import MODELS
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 _LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}

@@ -28,8 +28,7 @@ from gz_onboard.offline.sensors import speed_role, true_columns
 from gz_onboard.offline.series import first_soc
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed
-from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
-from gz_onboard.simulation.run import road_table
+from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
 

@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Sequence
+from array import array
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 from math import nan
+from operator import attrgetter
 
 import numpy as np
 
@@ -17,9 +20,7 @@ from gz_onboard.errors import brief
 from gz_onboard.model.drawable import drawable
 from gz_onboard.offline.arrays import stretches
 from gz_onboard.progress import Progress
-from gz_onboard.simulation.beyond import LOADED, Beyond, beyond_pack
-from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.parts.road import RoadProfile
+from gz_onboard.simulation.parts import Rider
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import Vehicle
 
@@ -47,13 +48,25 @@ COLUMNS = {
     "tyre_force": "N",
     "lean": "rad",  # positive right; 0 with a chassis that does not lean
 }
-"""The time series of a run, with their units; signs as in `physics.effect`, current positive discharging."""
+"""The time series of a run, with their units; signs as in `model.effect`, current positive discharging."""
+_STATES = {name: name for name in COLUMNS if name not in ("wanted_speed", "energy")} | {
+    "pack_current": "current",
+    "pack_voltage": "voltage",
+    "soc": "pack.soc",
+    "cell_temperature": "pack_cooling.temperature",
+    "motor_temperature": "motor_cooling.temperature",
+    "inverter_temperature": "inverter_cooling.temperature",
+    "bms_temperature": "bms_cooling.temperature",
+    "tyre_force": "force",
+}
+"""By column: the attribute of the scooter that has it."""
 
 SAMPLE = 0.1  # s: from row to row of the series
+# How far from its speed a cycle may be ridden: 3.2 km/h from any speed within 1 s (UN GTR No. 2, par. 7.2; 40 CFR
+# 1066.425).
 TOLERANCE = 3.2 / 3.6  # m/s
 TOLERANCE_TIME = 1.0  # s
-"""How far from its speed a cycle may be ridden: 3.2 km/h from any speed within 1 s (UN GTR No. 2, par. 7.2; 40 CFR
-1066.425)."""
+LOADED = 0.1  # state of charge: a ride that ended with more left was ended by the load
 
 Command = Callable[[Scooter], tuple[float, float, float]]
 """(throttle 0..1, brake 0..1, wanted speed [m/s] or not a number) for the next step."""
@@ -74,6 +87,20 @@ class Shortfall:
     def beyond_vehicle(self) -> bool:
         """Whether the throttle was open all along."""
         return self.throttle > 0.95
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """A pack at its cut-off voltage or below, or without charge; the state where that begins."""
+
+    charge: bool  # no charge is left; else the load pulled the voltage down
+    duration: float  # s, in all
+    cutoff: float  # V of the pack
+    time: float  # s
+    distance: float  # m
+    soc: float
+    current: float  # A
+    voltage: float  # V
 
 
 @dataclass
@@ -126,28 +153,22 @@ def drive(
 
     until_empty: end where the cells reach the cut-off voltage or SOC 0. finish: end at this distance [m].
     """
-    dt = scooter.dt
+    dt, step, states = scooter.dt, scooter.step, attrgetter(*_STATES.values())
     every = max(round(SAMPLE / dt), 1)
     battery = scooter.vehicle.pack
     cutoff = battery.cutoff_voltage * battery.cells_series
     end = finish if finish is not None else float("inf")
     kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
-    energy = recovered = charge = squares = 0.0
-    rows = [_row(scooter, nan, 0.0)]
+    rows, at = [(*states(scooter), nan)], [0]
+    drawn = array("d", (0.0, 0.0))  # current and voltage of each step
     done, empty, wanted = 0, False, nan
-    step = scooter.step
     for done in range(1, round(seconds / dt) + 1):
         throttle, brake, wanted = command(scooter)
         step(throttle, brake)
-        current = scooter.current
-        part = scooter.voltage * current * dt
-        energy += part
-        if part < 0.0:
-            recovered -= part
-        charge += current
-        squares += current * current
+        drawn.extend((scooter.current, scooter.voltage))
         if not done % every:
-            rows.append(_row(scooter, wanted, energy))
+            rows.append((*states(scooter), wanted))
+            at.append(done)
             if progress and not done % (100 * every):
                 progress(100 * every * dt)
         if scooter.distance >= end:
@@ -156,63 +177,30 @@ def drive(
             empty = True
             break
     if done % every:
-        rows.append(_row(scooter, wanted, energy))
-    series = _series(rows)
+        rows.append((*states(scooter), wanted))
+        at.append(done)
+    current, voltage = np.frombuffer(drawn).reshape(-1, 2).T
+    energy = np.cumsum(current * voltage) * dt
+    columns = dict(zip((*_STATES, "wanted_speed"), np.array(rows, dtype=float).T, strict=True), energy=energy[at])
+    series = {name: columns[name] for name in COLUMNS}
+    if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
+        series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
+    gained = {"kinetic_energy": scooter.kinetic_energy() - kinetic, "potential_energy": scooter.potential_energy()}
+    charge = float(current.sum())
     return Run(
         series=series,
-        ledger=_ledger(scooter, kinetic),
+        ledger={**scooter.ledger, **gained},
         chemical=scooter.pack.chemical_energy_drawn(),
-        energy=energy,
-        recovered=recovered,
+        energy=float(energy[-1]),
+        recovered=-float(np.minimum(current * voltage, 0.0).sum()) * dt,
         distance=scooter.distance,
         duration=done * dt,
         soc_start=soc_start,
         soc_end=scooter.pack.soc,
-        form_factor_squared=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
+        form_factor_squared=max(float(current @ current) * done / charge**2, 1.0) if charge else 1.0,
         empty=empty,
         beyond=beyond_pack(series, cutoff),
         shortfalls=shortfalls(series),
-    )
-
-
-def _series(rows: Sequence[tuple[float, ...]]) -> dict[str, Array]:
-    series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
-    if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
-        series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
-    return series
-
-
-def _ledger(scooter: Scooter, kinetic: float) -> dict[str, float]:
-    """Where the energy of a ride went; kinetic: energy [J] at its start."""
-    gained = {"kinetic_energy": scooter.kinetic_energy() - kinetic, "potential_energy": scooter.potential_energy()}
-    return {**scooter.ledger, **gained}
-
-
-def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
-    """The values of `COLUMNS`, in their order."""
-    return (
-        scooter.time,
-        scooter.distance,
-        scooter.speed,
-        wanted,
-        scooter.throttle,
-        scooter.brake,
-        0.0 if scooter.dynamometer else scooter.road(scooter.distance)[0],
-        scooter.wheel_speed / scooter.vehicle.parameters["gear_ratio"],
-        scooter.motor_current,
-        scooter.motor.torque_constant * scooter.motor_current,
-        scooter.current,
-        scooter.voltage,
-        scooter.pack.soc,
-        energy,
-        scooter.pack_cooling.temperature,
-        scooter.motor_cooling.stator,
-        scooter.inverter_cooling.board,
-        scooter.bms_cooling.temperature,
-        scooter.rear_load,
-        scooter.front_load,
-        scooter.force,
-        scooter.lean,
     )
 
 
@@ -221,10 +209,10 @@ def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
 
 def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Command:
     """A rider who follows `speeds` [m/s], one for each step of `dt` [s]; after the last it starts again."""
-    rider, count = rider or Rider(), len(speeds)
+    rider, wanted_speeds = rider or Rider(), cycle(speeds)
 
     def command(scooter: Scooter) -> tuple[float, float, float]:
-        wanted = speeds[round(scooter.time / dt) % count]
+        wanted = next(wanted_speeds)
         throttle, brake = rider.step(wanted, scooter.speed, dt)
         return throttle, brake, wanted
 
@@ -262,27 +250,25 @@ def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[f
     return values
 
 
-def road_table(
-    distance: Sequence[float], grade: Sequence[float], curvature: Sequence[float] | None = None, headwind: float = 0.0
-) -> RoadProfile:
-    """A road of pieces: at each `distance` [m] begins a piece of constant sine of grade and curvature [1/m]."""
-    bends = curvature or [0.0] * len(grade)
-    places = [(g, c, headwind) for g, c in zip(grade, bends, strict=True)]
-    starts = list(distance)
-    last = len(starts) - 1
-    here = 0
-
-    def road(at: float) -> tuple[float, float, float]:
-        nonlocal here  # the piece does not change for many steps
-        if starts[here] <= at and (here == last or at < starts[here + 1]):
-            return places[here]
-        here = min(max(bisect_right(starts, at) - 1, 0), last)
-        return places[here]
-
-    return road
+# --- demands beyond the vehicle ---------------------------------------------------------------------------------------
 
 
-# --- what the profile asked beyond the vehicle -------------------------------------------------------------------
+def beyond_pack(series: Mapping[str, Array], cutoff: float) -> tuple[Beyond, ...]:
+    """Where a load pulled the pack's voltage to `cutoff` [V] or below, and from where on it had no charge left.
+
+    series: by the names of `COLUMNS`.
+    """
+    time = series["time"]
+    step = float(time[1] - time[0]) if len(time) > 1 else 0.0
+    out = np.maximum.accumulate(series["soc"] <= 0.0)
+    low = (series["pack_voltage"] <= cutoff) & ~out
+    found = []
+    for charge, there in ((False, low), (True, out)):
+        if there.any():
+            i, seconds = int(np.argmax(there)), float(there.sum()) * step
+            names = ("time", "distance", "soc", "pack_current", "pack_voltage")
+            found.append(Beyond(charge, seconds, cutoff, *(float(series[name][i]) for name in names)))
+    return tuple(found)
 
 
 def shortfalls(series: dict[str, Array]) -> list[Shortfall]:

@@ -1,17 +1,15 @@
-"""The scooter of the thesis, forward-looking: force forward, speed back (Lord 2016, figs. 2.1 and 3.1).
+"""The simulated scooter, forward-looking: force forward, speed back (Lord 2016, figs. 2.1 and 3.1).
 
 Each step takes throttle and brake, finds the motor current that the controller allows, the torque at the wheel, the
 tyre's force and from it the new speeds of wheel and vehicle; then, with the speeds at the middle of the step, every
-watt from the battery to the road. Wheel, tyre and vehicle are solved together and implicitly, because the tyre's slip
-is stiff: with the mean speeds of the step each force times its speed is exactly the change of kinetic energy, and the
-ledger closes to rounding.
+watt from the battery to the road. A step only notes its powers; they are booked once a second, in columns.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from math import sqrt
+from operator import mul
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
@@ -21,14 +19,17 @@ from gz_onboard.model.model import air_density, drag_torque
 from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.offline.series import stepper
 from gz_onboard.offline.traits import traits
-from gz_onboard.simulation.parts.battery import FirstOrderPack, PackModel
-from gz_onboard.simulation.parts.brakes import Brakes
-from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
-from gz_onboard.simulation.parts.controller import Controller
-from gz_onboard.simulation.parts.driveline import Driveline
-from gz_onboard.simulation.parts.motor import EffectMotor, Motor
-from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
-from gz_onboard.simulation.parts.tyre import Tyre
+from gz_onboard.simulation.parts import (
+    Controller,
+    Driveline,
+    Dynamometer,
+    FirstOrderPack,
+    Motor,
+    PackModel,
+    RoadProfile,
+    straight,
+)
+from gz_onboard.simulation.turning import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.01  # s
@@ -38,6 +39,7 @@ SURROUNDINGS = frozenset({"heading", "time_moving", "vibration"})
 CELLS = frozenset({"soc", "cell_temperature", "cell_current"})
 LEAST_LOAD = 0.05  # of the weight, on the rear axle
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
+RARE = {"turning", "not_delivered"}  # in the ledger only if there was any
 
 
 class Options(TypedDict, total=False):
@@ -54,17 +56,14 @@ class Options(TypedDict, total=False):
     pack: PackModel | None
     motor: Motor | None
     chassis: Chassis | None
-    tyre_form: str  # transient; or steady, as the thesis prints it, see `Tyre`
-    brake_form: str  # friction; or viscous, as the thesis prints it, see `Brakes`
 
 
 class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
-    `pack`, `motor`, `chassis` may be any objects with the methods of `PackModel`, `Motor`, `Chassis`. A chassis that
-    turns is refused (InputError) together with an effect that is the same loss. Effects of the model in the cells act
-    in `FirstOrderPack` only. Without `vibration` a road is as rough as the vehicle's file expects, and a roller smooth.
-    `heading` by a number turns with the road.
+    A chassis that turns is refused (InputError) together with an effect that is the same loss. Effects in the cells
+    act in `FirstOrderPack` only. Without `vibration` a road is as rough as the vehicle's file expects, and a roller
+    smooth. A `heading` given as a number turns with the road.
     """
 
     def __init__(
@@ -84,15 +83,20 @@ class Scooter:
         self.current = self.motor_current = 0.0  # A; of the pack, of the motor
         self.throttle = self.brake = 0.0
         self.force = self.rear_load = self.front_load = 0.0  # N; of the driven tyre, on the axles
-        self.ledger = defaultdict[str, float](float)  # J by where it went, since the start
         self._q: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
-        self._begin(options)
+        self._set_surroundings(options)
         cells = options.get("cell_temperature")
         self._build_electric(options, self.ambient if cells is None else cells)
         self._build_mechanic(options)
+        self._names = [*self._force_names, *self._rolling_names, "turning", "dynamometer", "tyre_slip", "brakes"]
+        self._names += ["gearing", *self._loss_names, "bms", "battery_heat", "not_delivered", "idle", "charge"]
+        self._noted: list[tuple[float, ...]] = []  # of each step since the last booking, by `_names`
+        self._booked: dict[str, float] = dict.fromkeys(self._names, 0.0)  # J since the start; charge in A·s
+        self._cooled = dict(self._booked)  # the same at the last step of the cooling networks
+        self._since_cooling = 0.0  # s
         self._watch()
 
-    def _begin(self, options: Options) -> None:
+    def _set_surroundings(self, options: Options) -> None:
         """The surroundings that effects read."""
         heading, rough = options.get("heading", 0.0), options.get("vibration")
         self._heading_at = heading if callable(heading) else None
@@ -126,10 +130,18 @@ class Scooter:
         cells = model.at(Port.CELL_VOLTAGE)
         inside = stepper(cells, dt) if cells else None
         self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
-        self._inverter = stepper(model.at(Port.INVERTER_LOSS), dt, booked=True)
-        self._dc = stepper(model.at(Port.DC_POWER), dt, booked=True)
-        constants = p["torque_constant"], p["voltage_constant"]
-        self.motor: Motor = options.get("motor") or EffectMotor(model.at(Port.MOTOR_LOSS), dt, *constants, self._q)
+        self.motor = options.get("motor")
+        of_motor = [] if self.motor else model.at(Port.MOTOR_LOSS)
+        of_inverter = model.at(Port.INVERTER_LOSS)
+        losses = [*of_motor, *of_inverter, *model.at(Port.DC_POWER)]
+        turning_idly = self._q | {"motor_speed": 100.0, "motor_temperature": MILD}
+        self._losses, self._idle = stepper(losses, dt), stepper([e for e in of_motor if e(turning_idly)], None)
+        self._loss_names = ([self.motor.name] if self.motor else []) + [bound.effect.name for bound in losses]
+        motor_names = self._loss_names[: max(len(of_motor), 1 if self.motor else 0)]
+        inverter_names = [bound.effect.name for bound in of_inverter]
+        # The board's heat is in the pack's too, on which it stands: so its network was calibrated.
+        self._heats = {"motor": motor_names, "inverter": inverter_names, "pack": ["battery_heat", "bms"]}
+        self._torque_constant = p["torque_constant"]
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
         self.inverter_cooling = InverterCooling(p, self.ambient, self.ambient)
@@ -138,10 +150,6 @@ class Scooter:
         self.bms_cooling = LumpedCooling(p, "bms", celsius)
         self._cooling_factor = p["cooling_factor"]
         self._bms_resistance = min(p["bms_resistance"], battery.series_resistance)  # its part of it
-        # J in the current cooling period; idle: the motor's part that comes without current
-        self._heat = {"inverter": 0.0, "motor": 0.0, "idle": 0.0, "pack": 0.0, "bms": 0.0}
-        self._charge = 0.0  # A·s out of the pack in that period
-        self._since_cooling = 0.0
 
     def _build_mechanic(self, options: Options) -> None:
         """Chassis, tyre, brakes and the forces of the road."""
@@ -153,19 +161,15 @@ class Scooter:
                     f"model.effects lists {effect.name}, and the {self.chassis.name} chassis has the same loss: "
                     "it would count twice; take one of them"
                 )
-        tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=options.get("tyre_form", "transient"))
-        disc = p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"]
-        brakes = Brakes(*disc, p["front_brake_share"], options.get("brake_form", "friction"))
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
         forces = [e for e in model.at(Port.WHEEL_FORCE) if "acceleration" not in e.effect.reads]
         if roller:
             forces = [e for e in forces if e.effect.reads <= WHEEL_ONLY]
         rolling = model.at(Port.TYRE)
-        # The energy of effects that store it is booked as kinetic and potential energy.
-        self._force_names, self._rolling_names = (
-            [(i, x.effect.name) for i, x in enumerate(effects) if not x.effect.stores_energy]
-            for effects in (forces, rolling)
-        )
+
+        self._force_names, self._rolling_names = ([bound.effect.name for bound in part] for part in (forces, rolling))
+        # Energy that effects store is booked as kinetic and potential energy.
+        self._stored = {bound.effect.name for bound in (*forces, *rolling) if bound.effect.stores_energy}
         self._forces, self._rolling = stepper(forces, self.dt), stepper(rolling, self.dt)
         self._radius, self._gear, self._gear_efficiency = p["wheel_radius"], p["gear_ratio"], p["gear_efficiency"]
         self._weight = model.mass * GRAVITY
@@ -174,13 +178,45 @@ class Scooter:
         self._rear_share = 1 - p["cg_to_rear"] / p["wheelbase"]
         self._lever = p["cg_height"] / p["wheelbase"]
         rolls = p["wheel_inertia_front"] / self._radius**2  # the front wheel rolls without slip
-        mass = roller.inertia if roller else model.mass + rolls
-        self.driveline = Driveline(tyre, brakes, mass, p["wheel_inertia_rear"], roller is None)
+        self.driveline = Driveline(
+            tyre=(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"]),
+            brake_torque=p["brake_torque_limit"],
+            front_share=p["front_brake_share"],
+            moving_mass=roller.inertia if roller else model.mass + rolls,
+            wheel_inertia=p["wheel_inertia_rear"],
+            has_front_wheel=roller is None,
+        )
 
     @property
     def lean(self) -> float:
         """[rad], positive right; 0 of a chassis that does not lean."""
         return self._turn.lean
+
+    @property
+    def grade(self) -> float:
+        """Sine of the road's angle; 0 on a roller."""
+        return 0.0 if self.dynamometer else self.road(self.distance)[0]
+
+    @property
+    def motor_speed(self) -> float:
+        """[rad/s]."""
+        return self.wheel_speed / self._gear
+
+    @property
+    def motor_torque(self) -> float:
+        """In the air gap [N·m]."""
+        return self._torque_constant * self.motor_current
+
+    @property
+    def ledger(self) -> dict[str, float]:
+        """Energy [J] by where it went, since the start."""
+        self._book()
+        left_out = {"idle", "charge", *self._stored, *(() if self.dynamometer else ("dynamometer",))}
+        return {
+            name: energy
+            for name, energy in self._booked.items()
+            if name not in left_out and (energy or name not in RARE)
+        }
 
     def kinetic_energy(self) -> float:
         """Of vehicle and wheels [J]."""
@@ -192,18 +228,24 @@ class Scooter:
 
     def step(self, throttle: float, brake: float) -> None:
         """One step with throttle and brake [0..1]."""
-        dt, q, entries, roller = self.dt, self._q, self.ledger, self.dynamometer
-        v, w, gear = self.speed, self.wheel_speed, self._gear
+        dt, q, roller, gear = self.dt, self._q, self.dynamometer, self._gear
+        v, w = self.speed, self.wheel_speed
         self.throttle, self.brake = throttle, brake
         normal, turning, radius = self._on_the_road()
 
         # --- what acts (eqs. 2.1, 2.8, 3.1, 3.2, 3.5-3.7, 3.9)
         self.sensed_voltage += (self.voltage - self.sensed_voltage) * self._voltage_gain
         current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / self._series)
-        # The motor's current makes torque in the air gap; what turning costs without current is drag on the shaft.
-        idle = self.motor.idle(w / gear, self.motor_cooling.stator)
-        torque = self.motor.torque_constant * current - drag_torque(idle, w / gear)
-        drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
+        # The motor's current makes torque in the air gap; its loss without current is drag on the shaft.
+        stator = self.motor_cooling.stator
+        if self.motor:
+            idle = self.motor.loss(w / gear, 0.0, stator)
+        else:
+            q["motor_speed"], q["motor_temperature"], q["motor_current"], q["torque"] = w / gear, stator, 0.0, 0.0
+            idle = sum(self._idle(q))
+        torque = self._torque_constant * current
+        shaft = torque - drag_torque(idle, w / gear)
+        drive = shaft / gear * (self._gear_efficiency if shaft * w >= 0 else 1 / self._gear_efficiency)
         forces, rolling = self._forces(q), self._rolling(q)
         share = self.rear_load / normal
         front_share = 0.0 if roller else 1 - share
@@ -220,23 +262,44 @@ class Scooter:
         self.climb += q["grade"] * v_mean * dt
         self.time += dt
 
-        # --- every watt at the wheels
-        way = v_mean * dt
-        for i, name in self._force_names:
-            entries[name] += forces[i] * way
-        if turning:
-            entries["turning"] += turning * v_mean * dt
-        if roller:
-            entries["dynamometer"] += absorbed * v_mean * dt
-        turned = (share * radius * w_mean + front_share * v_mean) * dt
-        for i, name in self._rolling_names:
-            entries[name] += rolling[i] * turned
-        entries["tyre_slip"] += force * (radius * w_mean - v_mean) * dt
-        entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
-        mechanical = torque * w_mean / gear
-        entries["gearing"] += (mechanical - drive * w_mean) * dt
-        self._heat["idle"] += idle * dt
-        self._draw(mechanical, w_mean / gear, current)
+        # --- every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19)
+        mechanical = shaft * w_mean / gear
+        q["motor_speed"], q["motor_current"], q["torque"] = w_mean / gear, current, torque
+        losses = self._losses(q)
+        if self.motor:
+            losses = (self.motor.loss(w_mean / gear, current, stator), *losses)
+        power = mechanical + sum(losses)
+        self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
+        self.motor_current = current
+        missing = power - delivered
+        if missing <= 1e-6 * abs(power):
+            missing = 0.0
+        bms = self._bms_resistance * self.current * self.current  # in the pack's: the board lies in its current
+
+        # --- and at the wheels
+        turned = share * radius * w_mean + front_share * v_mean  # m/s, of the tyres
+        self._noted.append(
+            (
+                v_mean,
+                turned,
+                *forces,
+                *rolling,
+                turning * v_mean,
+                absorbed * v_mean,
+                force * (radius * w_mean - v_mean),
+                braking * w_mean + front_braking * v_mean,
+                mechanical - drive * w_mean,
+                *losses,
+                bms,
+                pack_heat - bms,
+                -missing,
+                idle,
+                self.current,
+            )
+        )
+        self._since_cooling += dt
+        if self._since_cooling >= PERIOD - 1e-9:
+            self._cool(self._since_cooling)
 
     def _on_the_road(self) -> tuple[float, float, float]:
         """(load of both axles [N], force of turning [N], rolling radius [m]); sets quantities and axle loads."""
@@ -262,29 +325,6 @@ class Scooter:
         self.front_load = normal - rear
         return normal, turning, radius
 
-    def _draw(self, mechanical: float, motor_speed: float, current: float) -> None:
-        """Every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19), and its heat."""
-        dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
-        q["motor_speed"], q["motor_current"], q["torque"] = motor_speed, current, self.motor.torque_constant * current
-        motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
-        inverter_heat = self._inverter(q, entries)
-        power = mechanical + motor_heat + inverter_heat + self._dc(q, entries)
-        self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
-        bms_heat = self._bms_resistance * self.current * self.current  # in the pack's: the board lies in its current
-        entries["bms"] += bms_heat * dt
-        entries["battery_heat"] += (pack_heat - bms_heat) * dt
-        if power - delivered > 1e-6 * abs(power):
-            entries["not_delivered"] -= (power - delivered) * dt
-        self.motor_current = current
-        heat["motor"] += motor_heat * dt
-        heat["inverter"] += inverter_heat * dt
-        heat["pack"] += pack_heat * dt  # the board's too, which stands on it: so its network was calibrated
-        heat["bms"] += bms_heat * dt
-        self._charge += self.current * dt
-        self._since_cooling += dt
-        if self._since_cooling >= PERIOD - 1e-9:
-            self._cool(self._since_cooling)
-
     def _track(self, curvature: float) -> None:
         """What effects read beyond speed and road, up to date before the step."""
         q = self._q
@@ -302,18 +342,32 @@ class Scooter:
         q["soc"], q["cell_temperature"] = self.pack.soc, self.pack_cooling.temperature
         q["cell_current"] = self.current / self.vehicle.pack.cells_parallel
 
+    def _book(self) -> None:
+        """Book the steps since the last booking."""
+        if not self._noted:
+            return
+        speed, turned, *columns = zip(*self._noted, strict=True)
+        forces = len(self._force_names)
+        for i in range(forces + len(self._rolling_names)):
+            columns[i] = tuple(map(mul, columns[i], speed if i < forces else turned))
+        for name, powers in zip(self._names, columns, strict=True):
+            self._booked[name] += sum(powers) * self.dt
+        self._noted.clear()
+
     def _cool(self, dt: float) -> None:
         """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31); a roller's fan follows it."""
-        heat, outside = self._heat, (self.ambient, abs(self.speed), self._cooling_factor)
-        self.inverter_cooling.step(dt, heat["inverter"] / dt, *outside)
-        self.motor_cooling.step(dt, heat["motor"] / dt, *outside, heat["idle"] / dt)
+        self._book()
+        mean = {name: (energy - self._cooled[name]) / dt for name, energy in self._booked.items()}
+        heat = {part: sum(mean[name] for name in names) for part, names in self._heats.items()}
+        outside = self.ambient, abs(self.speed), self._cooling_factor
+        self.inverter_cooling.step(dt, heat["inverter"], *outside)
+        self.motor_cooling.step(dt, heat["motor"], *outside, mean["idle"])
         cells, battery = self.pack_cooling.temperature, self.vehicle.pack
-        reversible = battery.reversible_heat(self._charge / dt, self.pack.soc, cells)
-        self.pack_cooling.step(dt, heat["pack"] / dt + reversible, *outside)
-        self.bms_cooling.step(dt, heat["bms"] / dt, self.pack_cooling.temperature)
-        for name in heat:
-            heat[name] = 0.0
-        self._since_cooling = self._charge = 0.0
+        reversible = battery.reversible_heat(mean["charge"], self.pack.soc, cells)
+        self.pack_cooling.step(dt, heat["pack"] + reversible, *outside)
+        self.bms_cooling.step(dt, mean["bms"], self.pack_cooling.temperature)
+        self._cooled = dict(self._booked)
+        self._since_cooling = 0.0
         self._q["motor_temperature"] = self.motor_cooling.stator
         self._watch()
 

@@ -21,7 +21,6 @@ from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.reports.results import times, write_json
 from gz_onboard.simulation.frames import Dropouts, check_output, messages_sent
 from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
-from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_plan, vehicle_on
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
@@ -29,6 +28,7 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.simulation.trace import Trace
+from gz_onboard.simulation.turning import MODELS, chassis
 from gz_onboard.vehicle import Vehicle, find_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty

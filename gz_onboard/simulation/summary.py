@@ -11,10 +11,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.reports.results import clock, descriptions, number, plain, text_rows, times
-from gz_onboard.simulation.beyond import LOADED
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
-from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
+from gz_onboard.simulation.run import COLUMNS, LOADED, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import Vehicle
 

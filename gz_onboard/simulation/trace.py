@@ -16,7 +16,7 @@ from gz_onboard.offline.arrays import running_mean
 from gz_onboard.offline.series import all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.turning.tyre import lean_of
+from gz_onboard.simulation.turning import lean_of
 
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
 _ALIKE = "time speed wheel_speed distance climb throttle brake motor_current vibration"

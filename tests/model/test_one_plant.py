@@ -26,9 +26,8 @@ from gz_onboard.model.model import air_density
 from gz_onboard.offline.arrays import block_means
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
-from gz_onboard.simulation.parts.battery import FirstOrderPack
-from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.parts import FirstOrderPack, Rider
+from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import read_vehicle
 
 LOG = Path(__file__).resolve().parents[2] / "replay_logs" / "city_14C.blf"
@@ -235,10 +234,10 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     assert block_means(fed + drags, 10) == pytest.approx(by_model, rel=1e-6, abs=1e-6)
     by_discovery = summed(system.terms(grid.quantities, values, 0.1, Port.INVERTER_LOSS))
     assert block_means(by_discovery, 10) == pytest.approx(inverter, rel=1e-6, abs=1e-6)
-    scooter = Scooter(VEHICLE, soc=SOC, ambient=AMBIENT)
-    motor = scooter.motor
-    rows = zip(ride["motor_speed"], ride["motor_current"], ride["motor_temperature"], strict=True)
-    booked = [motor.heat(*row, scooter.dt, scooter.ledger) for row in rows]
+    simulated = stepper(model.at(Port.MOTOR_LOSS), STEP)
+    names = [name for name in q if np.ndim(q[name])]
+    rows = zip(*(q[name] for name in names), strict=True)
+    booked = [sum(simulated(q | dict(zip(names, map(float, row), strict=True)))) for row in rows]
     assert booked == pytest.approx(by_model, rel=1e-6, abs=1e-6)
 
 

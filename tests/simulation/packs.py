@@ -1,12 +1,11 @@
 """A pack and a motor of another make, to put in place of the project's own."""
 
-from collections.abc import MutableMapping
 from dataclasses import dataclass
 from math import exp
 
 from gz_onboard.model.battery import Battery
 from gz_onboard.model.functions import Mesh
-from gz_onboard.simulation.parts.battery import FirstOrderPack
+from gz_onboard.simulation.parts import FirstOrderPack
 
 
 class SecondOrderPack(FirstOrderPack):
@@ -20,7 +19,7 @@ class SecondOrderPack(FirstOrderPack):
         fast, self.v1 = self.v1, self.v1 + self.v2
         current, voltage, heat, delivered = super().draw(power, dt, temperature)
         cell = current / self.battery.cells_parallel
-        self.v1 = self._decay * fast + (1 - self._decay) * self._r1 * cell
+        self.v1 = self._decay * fast + self._gain * current
         slow = exp(-dt / self.tau2)
         self.v2 = slow * self.v2 + (1 - slow) * self.r2 * cell
         return current, voltage, heat, delivered
@@ -30,16 +29,8 @@ class SecondOrderPack(FirstOrderPack):
 class MapMotor:
     """With a measured loss map [W] over current [A] and speed [rad/s]: the one of docs/explanation/simulation.md."""
 
-    loss: Mesh
-    torque_constant: float
-    voltage_constant: float
+    watts: Mesh
+    name: str = "motor_map_loss"
 
-    def heat(
-        self, speed: float, current: float, temperature: float, dt: float, ledger: MutableMapping[str, float]
-    ) -> float:
-        watts = self.loss.at(current, abs(speed))[0]
-        ledger["motor_map_loss"] += watts * dt
-        return watts
-
-    def idle(self, speed: float, temperature: float) -> float:
-        return self.loss.at(0.0, abs(speed))[0]
+    def loss(self, speed: float, current: float, temperature: float) -> float:
+        return self.watts.at(current, abs(speed))[0]

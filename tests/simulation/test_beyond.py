@@ -81,5 +81,5 @@ def test_with_limits_of_its_kind_its_ranges_agree(kick: Path, capsys):
     scooter, most = Scooter(read_vehicle(kick)), 0.0
     for _ in range(1500):
         scooter.step(1.0, 0.0)
-        most = max(most, scooter.motor_current * scooter.motor.torque_constant * scooter.wheel_speed)
+        most = max(most, scooter.motor_torque * scooter.wheel_speed)
     assert most == pytest.approx(800, rel=0.05)

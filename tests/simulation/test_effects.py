@@ -11,8 +11,7 @@ import pytest
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.model.effect import Port, load_effect, package_effects
 from gz_onboard.simulation.cycles import cycle, names
-from gz_onboard.simulation.parts.battery import FirstOrderPack
-from gz_onboard.simulation.parts.road import Dynamometer, straight
+from gz_onboard.simulation.parts import Dynamometer, FirstOrderPack, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, latency

@@ -17,13 +17,12 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import WINDOW, Reason, State
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
-from gz_onboard.simulation.parts.chassis import chassis
-from gz_onboard.simulation.parts.road import Dynamometer
-from gz_onboard.simulation.run import along, drive, road_table
+from gz_onboard.simulation.parts import Dynamometer, road_table
+from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS
 from gz_onboard.simulation.trace import Trace
-from gz_onboard.simulation.turning.tyre import lean_of
+from gz_onboard.simulation.turning import chassis, lean_of
 from gz_onboard.vehicle import read_vehicle
 from tests.events import events_of
 from tests.support import ROOT, reference, ridden

@@ -11,18 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.simulation.cycles import cycle
-from gz_onboard.simulation.parts.road import straight
-from gz_onboard.simulation.run import (
-    COLUMNS,
-    at_steps,
-    drive,
-    follow,
-    ran_empty,
-    range_by_energy,
-    replay,
-    road_table,
-    shortfalls,
-)
+from gz_onboard.simulation.parts import road_table, straight
+from gz_onboard.simulation.run import COLUMNS, at_steps, drive, follow, ran_empty, range_by_energy, replay, shortfalls
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sweep import redesigned
 from gz_onboard.vehicle import read_vehicle

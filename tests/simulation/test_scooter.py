@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.model.functions import Mesh
-from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.parts.road import Dynamometer, straight
+from gz_onboard.simulation.parts import Dynamometer, Rider, straight
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
 from tests.simulation.packs import MapMotor, SecondOrderPack
@@ -44,12 +43,10 @@ def town(t):
     ambient=st.floats(-5, 38),
     grade=st.floats(-0.08, 0.08),
     wind=st.floats(-6, 6),
-    form=st.sampled_from(["transient", "steady"]),
-    brakes=st.sampled_from(["friction", "viscous"]),
     ride=st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1), st.integers(20, 300)), min_size=1, max_size=8),
 )
-def test_the_ledger_closes_over_any_ride(soc, ambient, grade, wind, form, brakes, ride):
-    scooter = Scooter(VEHICLE, straight(grade, wind), soc=soc, ambient=ambient, tyre_form=form, brake_form=brakes)
+def test_the_ledger_closes_over_any_ride(soc, ambient, grade, wind, ride):
+    scooter = Scooter(VEHICLE, straight(grade, wind), soc=soc, ambient=ambient)
     for throttle, brake, steps in ride:
         for _ in range(steps):
             scooter.step(throttle if brake < 0.5 else 0.0, brake if brake >= 0.5 else 0.0)
@@ -112,17 +109,6 @@ def test_no_chatter_at_standstill_or_pulling_away():
     assert min(rises) >= -1e-9
 
 
-def test_the_printed_brake_never_quite_stands():
-    """Eq. 2.13: why friction is the default."""
-    printed = Scooter(VEHICLE, straight(-0.05), soc=0.8, speed=5.0, brake_form="viscous")
-    friction = Scooter(VEHICLE, straight(-0.05), soc=0.8, speed=5.0)
-    for _ in range(3000):
-        printed.step(0.0, 1.0)
-        friction.step(0.0, 1.0)
-    assert printed.speed > 0.05
-    assert abs(friction.speed) < 1e-6
-
-
 def test_coasting_down_against_a_fine_integration_written_out():
     """Eqs. 3.1-3.3 and 3.9 with the motor's iron drag and no current: another integrator, other code."""
     p = VEHICLE.parameters
@@ -176,10 +162,9 @@ def test_the_battery_can_be_replaced():
 
 
 def test_the_motor_can_be_replaced_by_a_measured_map():
-    p = VEHICLE.parameters
     speeds, currents = (0.0, 20.0, 40.0, 60.0), (-60.0, 0.0, 60.0, 120.0, 220.0)
     loss = tuple(tuple(0.017 * i * i + 0.9 * w + 0.0154 * w * w for i in currents) for w in speeds)
-    motor = MapMotor(Mesh(currents, speeds, loss), p["torque_constant"], p["voltage_constant"])
+    motor = MapMotor(Mesh(currents, speeds, loss))
     scooter = follow(Scooter(VEHICLE, soc=0.8, motor=motor), town, 200)
     assert scooter.ledger["motor_map_loss"] > 0
     assert "motor_copper_loss" not in scooter.ledger

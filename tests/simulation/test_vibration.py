@@ -18,7 +18,7 @@ from gz_onboard.lab.validate_components import battery_voltage, road_load
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.model.effect import MOVING, load_effect
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.simulation.parts.road import Dynamometer, straight
+from gz_onboard.simulation.parts import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter

@@ -14,7 +14,7 @@ import symbrim.bicycle as symbrim
 import sympy
 import sympy.physics.mechanics as me
 
-from gz_onboard.simulation.turning.tyre import ground_steer, lean_of
+from gz_onboard.simulation.turning import ground_steer, lean_of
 
 G = 9.80665
 MASS, WHEELBASE, CG_TO_REAR, CG_HEIGHT, RADIUS, CASTER, TRAIL = 185.0, 1.32, 0.57, 0.63, 0.245, 0.46, 0.08

@@ -8,19 +8,17 @@ it, and the turning wheels are gyroscopes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import root
 
-from gz_onboard.simulation.turning.machine import Rates, RoadConditions, step
-from gz_onboard.simulation.turning.study import STEP, ChassisModel, Steerer
-
 G = 9.80665
 
 
 @dataclass
-class Turn:
+class Equilibrium:
     yaw_rate: float
     lateral: float
     handlebar: float
@@ -49,38 +47,40 @@ def front_wheel(handlebar: float, lean: float, caster: float) -> tuple[float, fl
     return float(np.arctan2(-axle[0], axle[1])), float(np.arcsin(axle[2]))
 
 
-def pacejka(tyre, slip: float, camber: float) -> float:
-    stiffness, shape, peak = tyre.cornering_stiffness, 1.6, tyre.friction
-    shift = tyre.camber_stiffness * camber / stiffness
+def pacejka(p: Mapping[str, float], axle: str, slip: float, camber: float) -> float:
+    stiffness, shape, peak = p[f"cornering_stiffness_{axle}"], 1.6, p["side_friction"]
+    shift = p[f"camber_stiffness_{axle}"] * camber / stiffness
     return float(peak * np.sin(shape * np.arctan(stiffness / (shape * peak) * (slip + shift))))
 
 
-def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, full: bool = False) -> Turn:
+def steady_turn(
+    q: Mapping[str, float], speed: float, lean: float, *, upright: bool = False, full: bool = False
+) -> Equilibrium:
     """The turn at `speed` [m/s] of a machine that leans by `lean` [rad]; `upright`: with tyres and body that do not."""
-    m, p, b = machine.mass, machine.wheelbase, machine.cg_to_rear
-    a = p - b
-    arm = machine.cg_height - machine.crown
-    inside, height = arm * np.sin(lean), machine.crown + arm * np.cos(lean)
+    m, p, b = q["vehicle_mass"] + q["payload_mass"], q["wheelbase"], q["cg_to_rear"]
+    a, crown, spin = p - b, q["tyre_crown_radius"], q["wheel_inertia_front"] + q["wheel_inertia_rear"]
+    arm = q["cg_height"] - crown
+    inside, height = arm * np.sin(lean), crown + arm * np.cos(lean)
     tilt = 0.0 if upright else lean
-    high = machine.cg_height if upright else height
-    radius = machine.wheel_radius - machine.crown * (1 - np.cos(tilt))
-    drag = 0.5 * (101325 / (287.05 * 293.15)) * machine.drag_area * speed**2
+    high = q["cg_height"] if upright else height
+    radius = q["wheel_radius"] - crown * (1 - np.cos(tilt))
+    drag = 0.5 * (101325 / (287.05 * 293.15)) * q["drag_area"] * speed**2
 
-    def wheel(tyre, slip, camber, along, load):
+    def wheel(axle, slip, camber, along, load):
         fade = along / np.hypot(along, 0.1)
-        side = load * pacejka(tyre, slip, camber * fade)
+        side = load * pacejka(q, axle, slip, camber * fade)
         pressed = load * np.cos(camber) + side * np.sin(camber)
-        moment = load * tyre.twisting_arm * camber * fade
-        rolling = pressed * (machine.rolling_constant * fade + machine.rolling_speed * along)
+        moment = load * q["twisting_arm"] * camber * fade
+        rolling = pressed * (q["rolling_resistance_constant"] * fade + q["rolling_resistance_speed"] * along)
         return side, rolling + moment * np.sin(camber) / radius, moment
 
     def forces(x):
         r, v, bar, front, rear, drive = x
-        steer, camber = (bar, 0.0) if upright else front_wheel(bar, lean, machine.caster)
+        steer, camber = (bar, 0.0) if upright else front_wheel(bar, lean, q["caster_angle"])
         slip_f, slip_r = steer - np.arctan2(v + a * r, speed), -np.arctan2(v - b * r, speed)
         along = speed * np.cos(steer) + (v + a * r) * np.sin(steer)
-        side_f, back_f, moment_f = wheel(machine.front, slip_f, camber, along, front)
-        side_r, back_r, moment_r = wheel(machine.rear, slip_r, tilt, speed, rear)
+        side_f, back_f, moment_f = wheel("front", slip_f, camber, along, front)
+        side_r, back_r, moment_r = wheel("rear", slip_r, tilt, speed, rear)
         x_f = -side_f * np.sin(steer) - back_f * np.cos(steer)
         y_f = side_f * np.cos(steer) - back_f * np.sin(steer)
         return (x_f, y_f, moment_f), (drive - back_r, side_r, moment_r), (slip_f, slip_r, side_f, side_r, camber, along)
@@ -89,7 +89,7 @@ def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, fu
         r, v, _, front, rear, _ = x
         (x_f, y_f, moment_f), (x_r, y_r, moment_r), _ = forces(x)
         sideways = speed * r - full * r**2 * inside
-        gyroscope = full * machine.spin_inertia * speed / radius * r * np.cos(lean)
+        gyroscope = full * spin * speed / radius * r * np.cos(lean)
         return [
             (x_f + x_r - drag + m * v * r) / 100,
             (y_f + y_r - m * sideways) / 100,
@@ -109,13 +109,4 @@ def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, fu
     sliding = side_f * contact_f * np.sin(slip_f) + side_r * contact_r * np.sin(slip_r)
     twisting = front[2] * (along / radius * np.sin(camber) - x[0]) + rear[2] * (speed / radius * np.sin(tilt) - x[0])
     r, v, bar, load_f, load_r, drive = map(float, x)
-    return Turn(r, v, bar, load_f, load_r, drive, slip_f, slip_r, side_f, side_r, sliding + twisting)
-
-
-def held(chassis: ChassisModel, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
-    """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
-    rider = Steerer(chassis, roll, RoadConditions())
-    state = rider.start(speed)
-    for _ in range(round(seconds / dt)):
-        state, _ = step(rider.rates, state, dt)
-    return rider.rates(state)
+    return Equilibrium(r, v, bar, load_f, load_r, drive, slip_f, slip_r, side_f, side_r, sliding + twisting)
