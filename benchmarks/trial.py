@@ -32,7 +32,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from gz_onboard.discovery.baseline import baseline
-from gz_onboard.discovery.discovery import discover
+from gz_onboard.discovery.run import discover
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.reports.results import to_json

@@ -18,15 +18,14 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
-from gz_onboard.discovery.breakdown import before_and_after, binned, edges, pooled
-from gz_onboard.discovery.discovery import discover
-from gz_onboard.discovery.extension import write_model
-from gz_onboard.discovery.result import METRICS, Gain
-from gz_onboard.discovery.verdict import Discovery
+from gz_onboard.discovery.extend import write_model
+from gz_onboard.discovery.judgement import METRICS, Discovery, Gain
+from gz_onboard.discovery.report import before_and_after, binned, edges, pooled
+from gz_onboard.discovery.run import discover
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded
-from gz_onboard.vehicle import find_vehicle, read_vehicle
+from gz_onboard.vehicle import read_vehicle
 
 RIDES = Path(__file__).parents[1] / "replay_logs"
 TOWN = (RIDES / "city_14C.blf", RIDES / "city_34C.blf", RIDES / "turning" / "city_11C.mcap")
@@ -46,7 +45,7 @@ def main() -> None:
     town = discover(vehicle, rides[:-1], workers=2)
     with tempfile.TemporaryDirectory() as folder:
         extended = Path(folder) / "turning.toml"
-        write_model(town, vehicle, find_vehicle("reference"), extended)
+        write_model(town, vehicle, extended)
         runs = [simulated(name, Path(folder)) for name in ("reference", str(extended))]
     oval(runs, output / "turning_loss_oval.png")
 
@@ -56,7 +55,7 @@ def residual(found: Discovery, file: Path) -> None:
     cause = next(c for c in found.report.causes if c.name == "cornering_drag")
     before, after = before_and_after(found)
     figure = new_figure(11, 4.3)
-    mass = float(np.mean([line.ride.quantities["mass"][0] for line in found.lines]))
+    mass = float(np.mean([line.ride.quantities["mass"][0] for line in found.search.lines]))
     axes: list[Any] = []
     for i, (lines, title) in enumerate(((before, "before"), (after, "after"))):
         axis = figure.add_axes((0.07 + 0.47 * i, 0.12, 0.44, 0.74), sharey=axes[0] if axes else None)

@@ -18,8 +18,8 @@ from gz_onboard.calibration import report
 from gz_onboard.calibration.command import plain_options
 from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.cli import COMMANDS, command_line
-from gz_onboard.discovery.result import VERSION as DISCOVER_VERSION
-from gz_onboard.discovery.result import Report
+from gz_onboard.discovery.judgement import VERSION as DISCOVER_VERSION
+from gz_onboard.discovery.judgement import Report
 from gz_onboard.lab import estimate, validate
 from gz_onboard.model.effect import QUANTITIES, VEHICLE_PARAMETERS, Parameter, package_effects
 from gz_onboard.model.parameters import BATTERY_PARAMETERS

@@ -10,19 +10,19 @@ from typing import TypeAlias
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, read_ride, read_vehicle, vehicle_of
 from gz_onboard.calibration.vehicle_file import vehicle_output
-from gz_onboard.discovery import command as discovery
 from gz_onboard.discovery.baseline import baseline as learn_baseline
-from gz_onboard.discovery.baseline_file import write_baseline
-from gz_onboard.discovery.command import DiscoveryOptions
+from gz_onboard.discovery.baseline import write_baseline
+from gz_onboard.discovery.command import DiscoveryOptions, find_logs
+from gz_onboard.discovery.extend import write_model
+from gz_onboard.discovery.judgement import Discovery, Report
 from gz_onboard.discovery.mixed_model import MixedModel
-from gz_onboard.discovery.page import write_report
-from gz_onboard.discovery.result import Report
-from gz_onboard.discovery.summary import summary
-from gz_onboard.discovery.verdict import Discovery
-from gz_onboard.errors import brief, not_an_input, writing
+from gz_onboard.discovery.report import summary, write_report
+from gz_onboard.discovery.run import discover as find
+from gz_onboard.errors import InputError, brief, not_an_input, writing
 from gz_onboard.offline.arguments import checked
-from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.offline.table import Columns, Tabular, columns_of
+from gz_onboard.reports.results import distinct_names
 from gz_onboard.vehicle import Vehicle
 
 _CAUSE = ("name", "parameter", "value", "unit", "ci95_low", "ci95_high", "change", "energy_share", "varies")
@@ -54,7 +54,7 @@ class Discovered(Tabular):
         Raises InputError.
         """
         vehicle_output(Path(file), self.read)
-        return discovery.write_extended(self.found, self.vehicle, Path(file))
+        return write_model(self.found, self.vehicle, Path(file))[1]
 
     @checked
     def write_report(self, file: PathLike) -> None:
@@ -82,27 +82,28 @@ def discover(
     """
     known = vehicle_of(vehicle)
     samples, logs = _samples_of(rides, known)
-    found = discovery.explain(known, samples, options or DiscoveryOptions(), say=progress)
+    options = options or DiscoveryOptions()
+    effects = None if options.effects is None else Path(options.effects)
+    shared = effects, progress or (lambda _: None), options.jobs
+    found = find(known, samples, options.seed, *shared, options.holdout or ())
     return Discovered(found.report, known, found, [known.file, *logs])
 
 
 @dataclass(frozen=True)
 class Baseline(Tabular):
     """What healthy rides show of a vehicle. vehicle: as they show it, to be given to `discover`; before: as its file
-    says; note: how well the rides foretell each other; left_out: rides by name that are none on a road.
+    says; note: how well the rides predict each other, and which were left out.
     """
 
     vehicle: Vehicle
     before: Vehicle
     note: str
-    left_out: Sequence[str] = ()
     read: Sequence[Path] = field(repr=False, default=())  # files, which are not written over
 
     __repr__ = brief
 
     def __str__(self) -> str:
-        left = [f"left out, as no rides on a road: {', '.join(self.left_out)}"] if self.left_out else []
-        return "\n".join([self.note, *left])
+        return self.note
 
     def to_table(self) -> Columns:
         """A row for each parameter that was refitted: its value and standard deviation, before and after."""
@@ -142,11 +143,10 @@ def baseline(
     """
     known, options = vehicle_of(vehicle), options or DiscoveryOptions()
     samples, logs = _samples_of(rides, known)
-    healthy, left = discovery.on_roads(samples)
     effects = None if options.effects is None else Path(options.effects)
-    found = learn_baseline(known, healthy, effects, progress, options.jobs)
-    told = found.healthy.checked if isinstance(found.healthy, MixedModel) else ""
-    return Baseline(found, known, told, left, [known.file, *logs])
+    found = learn_baseline(known, samples, effects, progress or (lambda _: None), options.jobs)
+    assert isinstance(found.healthy, MixedModel)
+    return Baseline(found, known, found.healthy.checked, [known.file, *logs])
 
 
 def _samples_of(rides: Rides, known: Vehicle) -> tuple[list[Samples], list[Path]]:
@@ -156,15 +156,17 @@ def _samples_of(rides: Rides, known: Vehicle) -> tuple[list[Samples], list[Path]
     given = [
         (f"table {i}", log)
         for i, ride in enumerate(several, 1)
-        for log in (discovery.find_logs([Path(ride)]) if isinstance(ride, str | os.PathLike) else [ride])
+        for log in (find_logs([Path(ride)]) if isinstance(ride, str | os.PathLike) else [ride])
     ]
     logs = [ride for _, ride in given if isinstance(ride, Path)]
-    names = iter(discovery.ride_names(logs))
+    names = iter(distinct_names(logs, [ride_name(log) for log in logs]))
     samples: list[Samples] = []
     for name, ride in given:
         if isinstance(ride, Path):
             samples.append(replace(read_samples(ride, known), name=next(names)))
         else:
             samples.append(ride if isinstance(ride, Samples) else read_ride(ride, known, name=name))
-    discovery.told_apart([ride.name for ride in samples])
+    called = [ride.name for ride in samples]
+    if twice := sorted({name for name in called if called.count(name) > 1}):
+        raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")
     return samples, logs

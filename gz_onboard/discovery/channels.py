@@ -1,73 +1,77 @@
-"""The channels: each a residual with its blocks, what it needs, where it holds and what it depends on.
+"""The channels: each a residual with its blocks, the sensors it needs, where it holds and what it depends on.
 
 Each channel is an analytical redundancy relation (Gertler 1998; Krysander & Frisk 2008): a balance of one part of the
-vehicle that takes its inputs from sensors, not from the model of another part. So a fault in one part shows in few
-channels, and causes that look alike in the energy drawn (a heavier rider, a weaker magnet) do not in all of them.
-`residuals` says what is measured and what is taken off.
+vehicle whose inputs come from sensors, not from the model of another part. A fault in one part then shows in few
+channels, and causes that look alike in the energy drawn (a heavier rider, a weaker magnet) do not look alike in all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.discovery import residuals
-from gz_onboard.discovery.grid import Ride
-from gz_onboard.discovery.pack_power import pack_power
-from gz_onboard.discovery.residuals import SLOW
-from gz_onboard.discovery.system import System, Values
-from gz_onboard.model.effect import ROAD_LOAD, Port
+from gz_onboard.discovery.grid import COARSE, STEP, Ride
+from gz_onboard.discovery.residuals import System, Values
+from gz_onboard.model.effect import ROAD_LOAD, Effect, Port
+from gz_onboard.offline.arrays import block_means
 
-ROLLING, COASTING, FAST = 2.0, 3.0, 4.0  # m/s: above these the wheel rolls freely, coasts, GPS shows its speed well
-FIX = 2.5  # quality of a GPS fix, between that of two dimensions and of three
+ROLLING = 2.0  # m/s: above it the wheel rolls freely
 
 
-def _always(ride: Ride) -> Mask:
+def always(ride: Ride) -> Mask:
+    """Everywhere."""
     return np.ones(len(ride.time), dtype=bool)
 
 
-def _unbraked(faster: float, ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > faster) & ~ride.braking)
+def rolling(ride: Ride, least: float = ROLLING) -> Mask:
+    """Faster than `least` [m/s], without a brake."""
+    return np.asarray((np.abs(ride.quantities["speed"]) > least) & ~ride.braking)
 
 
-def _fast(ride: Ride) -> Mask:
-    fix = ride.signals["gps_fix"] > FIX if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
-    return np.asarray((np.abs(ride.quantities["speed"]) > FAST) & fix)
+def coasting(ride: Ride) -> Mask:
+    """Fast enough that wheel speeds can be compared, without a brake."""
+    return rolling(ride, 3.0)
 
 
-def _known_drive(ride: Ride) -> Mask:
-    """Where what drives it is known: all of the ride with a motor current, else where no brake takes a part of it."""
-    return _always(ride) if "motor_current" in ride.signals else np.asarray(~ride.braking | ride.standing)
+def fast(ride: Ride) -> Mask:
+    """Fast enough for a GPS speed, with a fix in three dimensions."""
+    fix = ride.signals["gps_fix"] > 2.5 if "gps_fix" in ride.signals else always(ride)
+    return np.asarray((np.abs(ride.quantities["speed"]) > 4.0) & fix)
+
+
+def known_drive(ride: Ride) -> Mask:
+    """Where the drive power is known: everywhere with a motor current, else where no brake takes a part of it."""
+    return always(ride) if "motor_current" in ride.signals else np.asarray(~ride.braking | ride.standing)
 
 
 class ChannelNoise(NamedTuple):
-    """Of a channel's blocks: standard deviations of the white and of the exponentially correlated part [unit]."""
+    """Standard deviations of the white and the exponentially correlated noise of a block [unit], correlation time."""
 
     white: float
     slow: float
-    time: float  # s: of the correlation
+    time: float  # s
 
     @property
     def sd(self) -> float:
-        """Of one block."""
+        """Standard deviation of one block."""
         return float(np.hypot(self.white, self.slow))
 
     def scaled(self, size: float) -> ChannelNoise:
-        """Of a channel whose unit weighs so much less."""
+        """The noise of a vehicle of another size."""
         return ChannelNoise(self.white * size, self.slow * size, self.time)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One residual: how long its blocks are, what it needs, where it holds, and which parameters it depends on.
+    """One residual: how long its blocks are, the roles it needs, where it holds, the parameters it depends on.
 
-    ports: those whose effects act on it. correlated: whether its noise is (if not, its blocks are independent).
+    ports: effects there act on it. correlated: False if its blocks are independent.
     """
 
     name: str
@@ -78,18 +82,70 @@ class Channel:
     parameters: tuple[str, ...]
     noise: ChannelNoise  # before any healthy ride, in a vehicle of size 1
     size: str = ""  # the size of `Sizes` that the noise grows with
-    steps: int = 1  # grid steps to one of the function's
-    holds: Callable[[Ride], Mask] = _always
+    steps: int = 1  # grid steps to one of the residual's
+    holds: Callable[[Ride], Mask] = always
     ports: tuple[Port, ...] = ()
-    battery: bool = False
+    battery: bool = False  # whether it needs the pack's cells
     correlated: bool = True
-    slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
-    rough: float = 0.0  # A of motor current, in a vehicle of size 1, that double a block's variance; 0: none do
-    shaken: float = 0.0  # m/s² of vibration that do; 0: none
-    fast: float = 0.0  # m/s that do, of a power: of what noise in a force makes at that speed; 0: none
+    slow: float = 0.0  # s: the shortest correlation of its noise; model errors are slow
+    rough: float = 0.0  # A of changing motor current, in a vehicle of size 1, that double the variance; 0: none do
+    shaken: float = 0.0  # m/s² of vibration that do
+    fast: float = 0.0  # m/s that do, in a power: force noise times speed
     fed_by: tuple[str, ...] = ()  # roles that it needs too, though not at each instant
     apart: float = math.inf  # s between samples of its roles, beyond which they do not show it
-    unless: tuple[str, ...] = ()  # channels that together show it in parts, where the motor's current was measured
+    unless: tuple[str, ...] = ()  # channels that together show it in parts, where the motor current was measured
+
+    def depends(self, effects: Sequence[Effect]) -> set[str]:
+        """The parameters that it depends on."""
+        acting = (e for e in effects if e.port in self.ports and not e.stores_energy)
+        return set(self.parameters).union(*(effect.takes for effect in acting))
+
+    def too_slow(self, ride: Ride) -> bool:
+        """Whether samples of its roles are too far apart."""
+        return any(ride.periods.get(role, 0.0) > self.apart for role in self.roles)
+
+    def usable(self, ride: Ride, system: System) -> bool:
+        """Whether the ride has the signals that it needs."""
+        if not {*self.roles, *self.fed_by} <= ride.have or (self.battery and system.battery is None):
+            return False
+        parts = [CHANNEL[name] for name in self.unless if "motor_current" in ride.have]
+        split = bool(parts) and all(part.usable(ride, system) for part in parts)
+        return not (split or self.too_slow(ride))
+
+    def mean(self, values: Array) -> Array:
+        """A quantity on the grid, averaged over the blocks."""
+        return block_means(values, round(self.block / STEP))
+
+    def support(self, ride: Ride) -> Mask:
+        """The blocks in which everything was measured and the channel holds, shape (blocks,)."""
+        good = self.holds(ride) & ride.mask(*self.roles)
+        if self.name == "voltage_timing":  # of steps from one to the next
+            good = good & np.append(good[1:], False)
+        return np.asarray(self.mean(good.astype(float)) > 0.99)  # all of it, but for rounding
+
+    def blocks(self, ride: Ride, p: Values, system: System) -> Array:
+        """The residual averaged over blocks, shape (blocks,); those without support too."""
+        means = block_means(self.residual(ride, p, system), round(self.block / STEP / self.steps))
+        return np.asarray(means[: len(ride.time) // round(self.block / STEP)])
+
+    def roughness(self, ride: Ride, system: System) -> Array:
+        """How much more than usual a block scatters, shape (blocks,).
+
+        Small errors of timing and dynamics weigh more where the current changes within a block; the accelerometer is
+        noisier on a rough road.
+        """
+        shaken = np.ones(len(ride.time) // round(self.block / STEP))
+        if self.shaken > 0 and "vibration" in ride.quantities:
+            shaken = shaken + self.mean(ride.quantities["vibration"] ** 2) / self.shaken**2
+        if self.fast > 0 and "motor_current" not in ride.have:
+            shaken = shaken * (1 + self.mean(ride.quantities["speed"] ** 2) / self.fast**2)
+        doubling = self.rough * system.sizes.current
+        if doubling <= 0:
+            return np.asarray(np.sqrt(shaken))
+        amperes = ride.quantities["motor_current"]
+        level = 0.2 * self.mean(np.abs(amperes))  # gain errors count as if a fifth of a steady current changed
+        swing = np.sqrt(np.maximum(self.mean(amperes**2) - self.mean(amperes) ** 2, 0.0))
+        return np.asarray(np.sqrt(shaken * (1 + ((swing + level) / doubling) ** 2)))
 
 
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
@@ -120,10 +176,9 @@ _CELL = (
     "resistance_current_cold",
 )
 
-# A block is as long as what the residual is of stays the same: 0.1 s where a delay shows, 2 s for currents, voltages
-# and speeds, 4 s where noise is to average out (of the accelerometer, of lamps), 10 s for heights and temperatures.
-# Noise is as on healthy rides of the reference scooter, until a baseline, or the rides themselves, say more.
-# rough: some of what a rider changes the current by; the less, the more two sensors' timing matters to the residual.
+# Blocks: 0.1 s where a delay shows, 2 s for currents, voltages and speeds, 4 s to average the noise of accelerometer
+# and lamps, 10 s for heights and temperatures. Noise is that of healthy rides of the reference scooter, until a
+# baseline or the rides themselves say more. rough: the lower, the more the timing of two sensors matters.
 CHANNELS = (
     Channel(
         "road_force",
@@ -131,7 +186,7 @@ CHANNELS = (
         block=4.0,
         roles=("motor_speed", "motor_current", "accel_x"),
         residual=residuals.road_force,
-        holds=partial(_unbraked, ROLLING),
+        holds=rolling,
         parameters=(*_TORQUE, *_SPEED, *_ROAD),
         ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
         noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
@@ -176,8 +231,8 @@ CHANNELS = (
         "W",
         block=4.0,
         roles=("pack_voltage", "pack_current"),
-        residual=pack_power,
-        holds=_known_drive,
+        residual=residuals.pack_power,
+        holds=known_drive,
         parameters=(*_TORQUE, *_SPEED, *_LOSSES, *_PACK, *_INVERTER_CURRENT, *_ROAD, "idle_current", "brake_light"),
         ports=(*ROAD_LOAD, Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER),
         noise=ChannelNoise(white=4.0, slow=2.0, time=60.0),
@@ -213,7 +268,7 @@ CHANNELS = (
         "cell_voltage",
         "V",
         block=2.0,
-        steps=SLOW,
+        steps=COARSE,
         roles=("pack_voltage", "pack_current"),
         residual=residuals.cell_voltage,
         parameters=(*_CELL, "pack_voltage_offset", "pack_series_resistance"),
@@ -249,7 +304,7 @@ CHANNELS = (
         block=2.0,
         roles=("gps_speed", "motor_speed"),
         residual=residuals.gps_speed,
-        holds=_fast,
+        holds=fast,
         parameters=(*_SPEED, "slip_per_force", "lean_radius", "gps_lag"),
         noise=ChannelNoise(white=0.1, slow=0.05, time=30.0),
     ),
@@ -259,7 +314,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_rear", "motor_speed"),
         residual=residuals.rear_speed,
-        holds=partial(_unbraked, COASTING),
+        holds=coasting,
         parameters=("speed_sensor_scale", "rear_scale", "wheel_lag"),
         noise=ChannelNoise(white=0.02, slow=0.01, time=30.0),
     ),
@@ -269,7 +324,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_front", "motor_speed"),
         residual=residuals.front_speed,
-        holds=partial(_unbraked, COASTING),
+        holds=coasting,
         parameters=("speed_sensor_scale", "front_scale", "front_lean", "slip_per_force", "wheel_lag"),
         noise=ChannelNoise(white=0.05, slow=0.02, time=30.0),
     ),
@@ -277,7 +332,7 @@ CHANNELS = (
         "motor_temperature",
         "K",
         block=10.0,
-        steps=SLOW,
+        steps=COARSE,
         roles=("motor_temperature", "ambient_temperature"),
         fed_by=("motor_current",),
         residual=residuals.motor_temperature,
@@ -301,7 +356,7 @@ CHANNELS = (
         "inverter_temperature",
         "K",
         block=10.0,
-        steps=SLOW,
+        steps=COARSE,
         roles=("inverter_temperature", "ambient_temperature"),
         fed_by=("motor_current",),
         residual=residuals.inverter_temperature,
@@ -323,7 +378,7 @@ CHANNELS = (
         "cell_temperature",
         "K",
         block=10.0,
-        steps=SLOW,
+        steps=COARSE,
         roles=("cell_temperature", "ambient_temperature", "pack_voltage", "pack_current"),
         residual=residuals.cell_temperature,
         parameters=(

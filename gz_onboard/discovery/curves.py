@@ -1,4 +1,4 @@
-"""Smooth curves over quantities: what a channel's residual looks like when no cause has its name."""
+"""Smooth curves over quantities: the form of a residual that no cause has a name for."""
 
 from __future__ import annotations
 
@@ -8,36 +8,159 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.discovery.curve_forms import CurveForm, columns_of, curve_forms
-from gz_onboard.discovery.linear import LinearRide, Noise, Normal, Population, fit_mixed, marginal
-from gz_onboard.discovery.mixed_model import HealthyCurve, MixedModel
-from gz_onboard.discovery.result import CONSTANT
-from gz_onboard.discovery.search import evidence
+from gz_onboard.discovery.channels import CHANNEL
+from gz_onboard.discovery.grid import STEP, Ride, smooth
+from gz_onboard.discovery.mixed_model import HealthyCurve, LinearChannel, LinearRide, MixedModel, Population, Statistics
+from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
+
+CONSTANT = "constant"  # the quantity of a residual that is the same everywhere
+KNOTS: dict[str, tuple[tuple[float, ...], str, str]] = {  # knots in a vehicle of size 1, unit, size they grow with
+    "speed": ((2.0, 4.5, 6.5, 8.5, 10.0, 11.5, 13.0, 15.0), "m/s", "speed"),
+    "acceleration": ((-2.0, -1.0, -0.3, 0.0, 0.3, 1.0, 2.0), "m/s²", ""),
+    "lateral_acceleration": ((-4.0, -2.0, -0.7, 0.0, 0.7, 2.0, 4.0), "m/s²", ""),
+    "grade": ((-0.08, -0.04, -0.015, 0.0, 0.015, 0.04, 0.08), "1", ""),
+    "heading": ((0.0, 0.9, 1.8, 2.7, 3.6, 4.5, 5.4), "rad", ""),
+    "motor_temperature": ((0.0, 15.0, 30.0, 40.0, 50.0, 65.0, 80.0), "degC", ""),
+    "time": ((0.0, 120.0, 240.0, 400.0, 600.0, 800.0, 1200.0), "s", ""),
+    "motor_current": ((-40.0, 0.0, 20.0, 50.0, 90.0, 140.0, 200.0), "A", "current"),
+    "current_change": ((0.0, 5.0, 15.0, 30.0, 60.0, 100.0), "A", "current"),
+    "pack_current": ((-15.0, 0.0, 8.0, 20.0, 40.0, 60.0, 90.0), "A", "current"),
+    "soc": ((0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0), "1", ""),
+    "steering": ((-0.5, -0.2, -0.06, 0.0, 0.06, 0.2, 0.5), "rad", ""),
+    "vibration": ((0.3, 0.7, 1.0, 1.4, 1.9, 2.5, 3.3), "m/s²", ""),
+    "suspension_speed": ((0.02, 0.06, 0.1, 0.14, 0.19, 0.25, 0.35), "m/s", ""),
+    "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s", ""),
+    CONSTANT: ((0.0,), "1", ""),
+}
+# channel: (unit of a curve's coefficients in that of the channel, in a vehicle of size 1; their scatter between rides
+# in this unit; quantities)
+CURVES: dict[str, tuple[float, float, tuple[str, ...]]] = {
+    "road_force": (5.0, 0.3, tuple(name for name in KNOTS if name not in ("pack_current", "soc", CONSTANT))),
+    "inverter_power": (10.0, 0.3, ("speed", "motor_current", "motor_temperature", "time", "current_change")),
+    "pack_power": (
+        40.0,
+        0.3,
+        ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "time", "vibration", CONSTANT),
+    ),
+    "auxiliary": (2.0, 0.3, ("speed", "motor_temperature", "time", "pack_current", "vibration")),
+    "pack_balance": (0.1, 0.3, ("speed", "pack_current", "motor_temperature", "time")),
+    "cell_voltage": (0.005, 1.0, ("pack_current", "soc", "time", "current_change", "vibration")),
+}
+IN_PROPORTION = ("time", "current_change", "steering", "vibration", "suspension_speed")
+"""Quantities that something may be in proportion to and that no candidate is: each is a try of its own."""
 
 
-def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) -> Normal | None:
-    """`normal` with the columns of `form`."""
-    knots = columns_of(linear, form)
+@dataclass(frozen=True)
+class CurveConfig:
+    """When a curve is determined by rides."""
+
+    ridge: float = 2e-3  # information that bounds knots without data
+    own_rounds: int = 10  # of expectation and maximisation
+    own_free: float = 100.0  # variance of the common curve while its scatter between rides is sought
+    least_spread: float = 0.05  # sd of a quantity over the distance of two knots
+    visited: float = 1.0  # sum of squared weights of a ride's blocks at a knot
+
+
+FITTING = CurveConfig()
+
+
+@dataclass(frozen=True)
+class CurveForm:
+    """A curve of a channel over a quantity, or a straight line through 0, which needs less to be seen.
+
+    size: unit of its coefficients, in the channel's. scatter: by which they differ between rides, in `size`.
+    """
+
+    channel: str
+    quantity: str
+    straight: bool
+    knots: tuple[float, ...]
+    size: float
+    scatter: float
+
+    @property
+    def name(self) -> str:
+        """``channel over quantity``; of a straight line ``channel along quantity``."""
+        return f"{self.channel} {'along' if self.straight else 'over'} {self.quantity}"
+
+    @property
+    def basis(self) -> Array:
+        """Values at the knots for coefficients of one, (knots, k)."""
+        knots = np.array(self.knots)
+        return np.asarray(knots[:, None] / np.abs(knots).max()) if self.straight else np.eye(len(knots))
+
+
+def curve_form(channel: str, quantity: str, straight: bool = False, sizes: Sizes = USUAL_SIZES) -> CurveForm:
+    """The curve of `channel` over `quantity` in a vehicle of `sizes`."""
+    knots, _, grows = KNOTS[quantity]
+    size, scatter, _ = CURVES[channel]
+    scaled = tuple(knot * sizes.of(grows) for knot in knots)
+    return CurveForm(channel, quantity, straight, scaled, size * sizes.of(CHANNEL[channel].size), scatter)
+
+
+def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
+    """All curves, then all straight lines, of a vehicle of `sizes`."""
+    pairs = [(channel, quantity) for channel, (_, _, quantities) in CURVES.items() for quantity in quantities]
+    forms = [curve_form(*pair, sizes=sizes) for pair in pairs]
+    return [*forms, *(replace(form, straight=True) for form in forms if form.quantity in IN_PROPORTION)]
+
+
+def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
+    """The quantity over the blocks of `table`, (m,); None if the ride did not measure it."""
+    if not ride.shows(name):
+        return None
+    if name == CONSTANT:
+        return np.zeros(len(table.y))
+    values = ride.quantities.get(name)
+    if name == "current_change":
+        current = ride.signals["motor_current"]
+        return np.asarray(np.sqrt(np.maximum(table.over(current**2) - table.over(current) ** 2, 0)))
+    if name == "grade" and "gps_altitude" in ride.signals:  # the accelerometer's noise is in the channel
+        rise = np.gradient(smooth(ride.signals["gps_altitude"], 8.0), STEP)
+        values = smooth(rise, 8.0) / np.maximum(smooth(np.abs(ride.quantities["speed"]), 8.0), 2.0)
+    return None if values is None else table.over(values)
+
+
+def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
+    """Linear hat functions over `knots`, (m, k); periodic: of an angle [rad], the last meets the first."""
+    at = [*knots, 2 * np.pi] if periodic else knots
+    inside = np.mod(x, 2 * np.pi) if periodic else x
+    full: Array = np.array([np.interp(inside, at, hat) for hat in np.eye(len(at))]).T
+    if periodic:
+        full[:, 0] += full[:, -1]
+        full = full[:, :-1]
+    return full
+
+
+def columns_of(line: LinearRide, form: CurveForm) -> Array | None:
+    """The hat functions over the blocks of the channel, (m, knots); None if the ride did not measure the quantity."""
+    table = line.tables.get(form.channel)
+    x = quantity(line.ride, form.quantity, table) if table is not None else None
+    return None if x is None else hat_functions(x, form.knots, form.quantity == "heading")
+
+
+def extended(mixed: MixedModel, line: LinearRide, form: CurveForm) -> Statistics | None:
+    """The statistics of `line` with the coefficients of `form` as further parameters; None as of `columns_of`."""
+    knots = columns_of(line, form)
     if knots is None:
         return None
-    table = linear.tables[form.channel]
+    table = line.tables[form.channel]
     curve = knots @ form.basis * form.size / table.unit[:, None]
-    return normal.padded(curve.shape[1]).with_columns(table, noise[form.channel], curve, slice(len(normal.b)))
+    return line.statistics.padded(curve.shape[1]).with_columns(table, mixed.noise[form.channel], curve)
 
 
-CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
-OWN_ROUNDS = 10  # of expectation and maximisation
-OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
-LEAST_SPREAD = 0.05  # standard deviation of a quantity, over the distance of two knots, of which a curve can be told
-ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
+def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> Population:
+    """`mixed` with the coefficients of `form`, known within `covariance` (k, k)."""
+    k, healthy = len(covariance), mixed.shapes.get(form.name)
+    return mixed.bordered(healthy.mean if healthy else np.zeros(k), covariance, np.full(k, form.scatter**2))
 
 
 @dataclass(frozen=True)
 class CurveFit:
-    """What rides show over a quantity. chi2: twice the rise of the log likelihood, of `k` degrees of freedom.
+    """A curve that rides show. chi2: twice the rise of the log likelihood, with `k` degrees of freedom.
 
-    values (knots,): of the curve at each knot [the channel's unit]; covariance (knots, knots); weights (knots,): how
-    much of the rides is at each, together 1.
+    values (knots,) at the knots [the channel's unit]; covariance (knots, knots); weights (knots,): share of the rides
+    at each.
     """
 
     chi2: float
@@ -46,140 +169,97 @@ class CurveFit:
     covariance: Array
     weights: Array
 
-    @property
-    def sd(self) -> Array:
-        """Of the values, (k,)."""
-        return np.asarray(np.sqrt(np.abs(np.diag(self.covariance))))
-
     def contrasts(self) -> tuple[Array, Array]:
-        """(values less their mean, standard deviations of these), each (k,): what no constant could be."""
+        """(values minus their mean, standard deviations of these), each (knots,): what no constant could be."""
         d = np.eye(len(self.values)) - self.weights
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
-def visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
-    """The sum of squared weights of each ride's blocks at each knot, (rides that have it, knots)."""
-    columns = (columns_of(line, form) for line in linears)
-    rows = [(knots**2).sum(axis=0) for knots in columns if knots is not None]
-    return np.array(rows).reshape(-1, len(form.knots))
+def supported_knots(form: CurveForm, lines: Sequence[LinearRide]) -> tuple[Array, Array]:
+    """(coefficients that the rides determine, (k, free); share of the rides at each knot).
 
-
-def varies(form: CurveForm, linears: Sequence[LinearRide]) -> bool:
-    """Whether the rides differ in the quantity of `form`, within or between them, by `LEAST_SPREAD` or more."""
-    found = [knots for line in linears if (knots := columns_of(line, form)) is not None]
-    return bool(found) and float(np.concatenate(found).var(axis=0).sum()) > 2 * LEAST_SPREAD**2
-
-
-def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
-    """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
-    at goes with the nearest that has it, so that no curve bends where hardly anything was measured. None of them where
-    the rides hardly differ in the quantity: it would be a constant by another name.
+    A knot that fewer than two rides visit moves with its nearest visited neighbour, so that no curve bends where
+    nothing was measured. No coefficient is free where the quantity hardly varies: the curve would be a constant.
     """
-    if form.quantity != CONSTANT and not varies(form, linears):
-        return np.zeros((form.basis.shape[1], 0))
+    found = [knots for line in lines if (knots := columns_of(line, form)) is not None]
+    visits = np.array([(knots**2).sum(axis=0) for knots in found]).reshape(-1, len(form.knots))
+    weights = visits.sum(axis=0) / max(float(np.sum(visits)), 1e-12)
+    none = np.zeros((form.basis.shape[1], 0)), weights
+    if not found:
+        return none
+    spread = float(np.concatenate(found).var(axis=0).sum())
+    if form.quantity != CONSTANT and spread <= 2 * FITTING.least_spread**2:
+        return none
     if form.straight:
-        return np.eye(1)
-    good = np.flatnonzero((visits(form, linears) >= ENOUGH).sum(axis=0) >= min(2, len(linears)))
-    if not len(good):
-        return np.zeros((len(form.knots), 0))
-    if len(good) == 1 and form.quantity != CONSTANT:
-        return np.zeros((len(form.knots), 0))
+        return np.eye(1), weights
+    good = np.flatnonzero((visits >= FITTING.visited).sum(axis=0) >= min(2, len(lines)))
+    if len(good) < (1 if form.quantity == CONSTANT else 2):
+        return none
     nearest = np.abs(np.arange(len(form.knots))[:, None] - good).argmin(axis=1)
-    return np.asarray(np.eye(len(good))[nearest])
+    return np.asarray(np.eye(len(good))[nearest]), weights
 
 
 def fit_curve(
-    mixed: MixedModel,
-    linears: Sequence[LinearRide],
-    normals: Sequence[Normal],
-    form: CurveForm,
-    fixed: Sequence[int],
-    own: bool = False,
+    mixed: MixedModel, lines: Sequence[LinearRide], form: CurveForm, fixed: Sequence[int], own: bool = False
 ) -> CurveFit | None:
-    """What `form` is beside changes at `fixed`; None where no ride has it, or not enough of it.
+    """The curve of `form` with the parameters at `fixed` refitted; None if too little of it was measured.
 
-    own: with the scatter of its coefficients that these rides show, where it is more than `CurveForm.scatter`.
+    own: with the scatter of its coefficients that these rides show, if it is more than usual.
     """
-    free = supported_knots(form, linears)
-    rides = _with_columns(mixed, linears, normals, form)
-    if not rides or not free.shape[1]:
+    free, weights = supported_knots(form, lines)
+    if not free.shape[1]:
         return None
-    p = len(mixed.mean)
-    k = len(rides[0].b) - p
+    rides = [ride for line in lines if (ride := extended(mixed, line, form)) is not None]
+    p, k = len(mixed.mean), len(free)
     healthy = mixed.shapes.get(form.name)
     covariance = healthy.covariance if healthy else np.eye(k) * form.scatter**2
     known = bordered(mixed, form, covariance)
     if own and len(rides) > 1:
-        wide = bordered(mixed, form, covariance + np.eye(k) * OWN_FREE)
-        shown = fit_mixed(rides, wide, 1.0, np.arange(p + k) >= p, OWN_ROUNDS).scatter
+        wide = bordered(mixed, form, covariance + np.eye(k) * FITTING.own_free)
+        shown = wide.fit(rides, 1.0, np.arange(p + k) >= p, FITTING.own_rounds).scatter
         known = replace(known, scatter=np.maximum(known.scatter, shown))
-    inner, score = evidence(known, rides).profiled(range(p, p + k), fixed, CURVE_RIDGE)
-    inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
-    score = free.T @ score
-    estimate = np.linalg.solve(inner, score)
-    at = form.basis @ free * form.size
-    visited = visits(form, linears).sum(axis=0)
-    weights = visited / np.sum(visited)
+    shown_by = known.evidence(rides).profiled(range(p, p + k), fixed)
+    inner = free.T @ (shown_by.information + FITTING.ridge * np.eye(k)) @ free
+    score = free.T @ shown_by.score
+    estimate, at = np.linalg.solve(inner, score), form.basis @ free * form.size
     return CurveFit(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, weights)
 
 
-def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> Population:
-    """`mixed` with the coefficients of `form`, which are known within `covariance` (k, k)."""
-    k, healthy = len(covariance), mixed.shapes.get(form.name)
-    return mixed.bordered(healthy.mean if healthy else np.zeros(k), covariance, np.full(k, form.scatter**2))
-
-
-def _with_columns(
-    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal], form: CurveForm
-) -> list[Normal]:
-    """The normal equations of the rides that have `form`, with its columns."""
-    every = (extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True))
-    return [ride for ride in every if ride is not None]
-
-
-def learn_healthy_curves(
-    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal]
-) -> dict[str, HealthyCurve]:
-    """What the healthy rides leave over each quantity, beside what the parameters of `mixed` explain."""
+def healthy_curves(mixed: MixedModel, lines: Sequence[LinearRide]) -> dict[str, HealthyCurve]:
+    """The curves that healthy rides leave with the parameters of `mixed` as they were learned."""
     found = {}
-    for form in curve_forms(mixed.sizes):
-        rides = _with_columns(mixed, linears, normals, form)
+    for form in curve_forms(mixed.system.sizes):
+        rides = [ride for line in lines if (ride := extended(mixed, line, form)) is not None]
         if not rides:
             continue
         p = len(mixed.mean)
-        k = len(rides[0].b) - p
-        # the parameters stay as they were learned: their values at the mean, the curve what is left
+        k = len(rides[0].score) - p
         m, c = np.zeros((k, k)), np.zeros(k)
         for ride in rides:
-            v = np.linalg.inv(np.diag(1 / mixed.scatter) + ride.n[:p, :p])
-            u = mixed.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ mixed.mean)
-            inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]
-            score = ride.b[p:] - ride.n[p:, :p] @ u
-            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, form.scatter**2))
-            m, c = m + part.n, c + part.b
+            n, b = ride.information, ride.score
+            v = np.linalg.inv(np.diag(1 / mixed.scatter) + n[:p, :p])
+            u = mixed.mean + v @ (b[:p] - n[:p, :p] @ mixed.mean)
+            inner = n[p:, p:] - n[p:, :p] @ v @ n[:p, p:]
+            part = Statistics((inner + inner.T) / 2, b[p:] - n[p:, :p] @ u).marginal(np.full(k, form.scatter**2))
+            m, c = m + part.information, c + part.score
         covariance = np.linalg.inv(m + np.eye(k))
         found[form.name] = HealthyCurve(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
     return found
 
 
 def with_inflation(
-    mixed: MixedModel,
-    folds: Sequence[tuple[MixedModel, Sequence[int]]],
-    linears: Sequence[LinearRide],
-    normals: Sequence[Normal],
+    mixed: MixedModel, folds: Sequence[tuple[MixedModel, Sequence[int]]], lines: Sequence[LinearRide]
 ) -> dict[str, HealthyCurve]:
-    """The shapes of `mixed`, each with how much too high its score is on healthy rides left out of `folds`."""
+    """The healthy curves of `mixed` with the inflation of their scores on rides left out of `folds`."""
     total: dict[str, list[float]] = {}
     for learned, held in folds:
-        rest = [i for i in range(len(linears)) if i not in held]
-        shapes = learn_healthy_curves(learned, [linears[i] for i in rest], [normals[i] for i in rest])
-        blind = replace(learned, shapes=shapes)
-        for form in curve_forms(mixed.sizes):
-            found = fit_curve(blind, [linears[i] for i in held], [normals[i] for i in held], form, [])
+        blind = replace(learned, shapes=healthy_curves(learned, [x for i, x in enumerate(lines) if i not in held]))
+        for form in curve_forms(mixed.system.sizes):
+            found = fit_curve(blind, [lines[i] for i in held], form, [])
             if found:
                 total.setdefault(form.name, []).append(found.chi2 / found.k)
-    whole = learn_healthy_curves(mixed, linears, normals)
-    return {
-        name: replace(shape, inflation=max(1.0, (2 + sum(total.get(name, []))) / (2 + len(total.get(name, [])))))
-        for name, shape in whole.items()
-    }
+    result = {}
+    for name, shape in healthy_curves(mixed, lines).items():
+        ratios = total.get(name, [])
+        result[name] = replace(shape, inflation=max(1.0, (2 + sum(ratios)) / (2 + len(ratios))))
+    return result

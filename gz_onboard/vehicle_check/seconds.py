@@ -10,8 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.can.mapping import UNITS, known_units, to_si
-from gz_onboard.discovery.grid import averaged, measured
-from gz_onboard.discovery.stand_ins import delays
+from gz_onboard.discovery.grid import averaged, delays, measured
 from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import true_columns

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.cli import main
-from gz_onboard.discovery.candidates import candidates
-from gz_onboard.discovery.discovery import discover
-from gz_onboard.discovery.result import Report
+from gz_onboard.discovery.judgement import Report
+from gz_onboard.discovery.parameters import candidates
+from gz_onboard.discovery.run import discover
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.reports.results import descriptions
@@ -46,7 +46,6 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
         ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),
         ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
-        ([str(RIDE), "--format", "svg"], "--format svg: is for the pictures of --report HTML"),
         ([str(RIDE), "--payload", "9000"], "must be 0 to 3000 kg"),
         ([str(RIDE), "--baseline", "out.toml", "--quiet"], "three are the least"),
         ([str(LOGS / "coastdown.blf"), "--quiet", "--vehicle", str(CAR)], "knows none of its"),
@@ -111,7 +110,7 @@ def test_one_healthy_ride(alone: Path):
 
 def test_the_report_is_one_file_with_its_pictures(alone: Path):
     page = (alone / "out.html").read_text()
-    assert page.count("data:image/webp;base64,") >= 3
+    assert page.count('<svg class="drawn"') >= 3
     assert 'src="http' not in page
 
 
@@ -120,10 +119,10 @@ def test_rides_held_out_by_name_have_no_part_in_anything():
     rides = [read_samples(LOGS / f"city_{name}.blf", vehicle) for name in ("14C", "34C")]
     found = discover(vehicle, rides, holdout=["city_34C"])
     report = found.report
-    assert [line.ride.name for line in found.lines] == ["city_14C"]
+    assert [line.ride.name for line in found.search.lines] == ["city_14C"]
     assert report.gain.holdout == ("city_34C",) and report.gain.apart
     alone = discover(vehicle, rides[:1]).report
     assert [c.name for c in report.causes] == [c.name for c in alone.causes]
     assert report.ranking == alone.ranking
-    with pytest.raises(InputError, match="none is left"):
+    with pytest.raises(InputError, match="no ride is left"):
         discover(vehicle, rides, holdout=["city_14C", "city_34C"])

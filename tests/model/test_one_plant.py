@@ -15,9 +15,8 @@ from gz_onboard.calibration.cooling_network import ENTROPY, ENTROPY_SOC, motor_t
 from gz_onboard.calibration.cooling_run import CoolingRun
 from gz_onboard.calibration.road_load import RoadLoad
 from gz_onboard.discovery import residuals
-from gz_onboard.discovery.grid import Ride, read_ride
+from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.mixed_model import initial
-from gz_onboard.discovery.system import summed
 from gz_onboard.estimator.cells import Cell
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port
@@ -52,7 +51,7 @@ def simulated():
 
 def recorded():
     """The same of a recorded one."""
-    ride = read_ride(read_samples(LOG, VEHICLE), VEHICLE)
+    ride = initial(VEHICLE).ride(read_samples(LOG, VEHICLE))
     names = ("pack_current", "motor_current", "pack_voltage", "motor_temperature")
     found = {name: block_means(ride.signals[name], 10) for name in names}
     return found | {name: block_means(ride.quantities[name], 10) for name in ("speed", "cell_temperature")}
@@ -78,7 +77,9 @@ def on_grid(ride):
     quantities |= {"grade_cosine": np.ones(n), "air_density": np.full(n, air_density(AMBIENT))}
     quantities["mass"] = np.full(n, VEHICLE.model.mass)
     radius = P["wheel_radius"] * P["gear_ratio"]
-    return Ride("ride", np.linspace(0.0, (n - 1) * 0.1, n), signals, {}, radius, P["payload_mass"], quantities)
+    made = Ride("ride", np.linspace(0.0, (n - 1) * 0.1, n), signals, {}, radius, P["payload_mass"], quantities)
+    made.start_soc = residuals.start_soc(made, healthy()[1])
+    return made
 
 
 def healthy():
@@ -232,7 +233,7 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     grid = on_grid(ride)
     fed, drags = residuals.motor_losses(grid, residuals.moving(grid, values, system), values, system)
     assert block_means(fed + drags, 10) == pytest.approx(by_model, rel=1e-6, abs=1e-6)
-    by_discovery = summed(system.terms(grid.quantities, values, 0.1, Port.INVERTER_LOSS))
+    by_discovery = system.sum(grid.quantities, values, 0.1, Port.INVERTER_LOSS)
     assert block_means(by_discovery, 10) == pytest.approx(inverter, rel=1e-6, abs=1e-6)
     simulated = stepper(model.at(Port.MOTOR_LOSS), STEP)
     names = [name for name in q if np.ndim(q[name])]
@@ -311,8 +312,8 @@ def test_everyone_has_the_same_road_load(ride):
         sum((np.broadcast_to(ledger[name], n) for name in on_road - stored), np.zeros(n))[moving]
         / ride["speed"][moving]
     )
-    terms = system.terms(on_grid(ride).quantities, values, 0.1, *ROAD_LOAD)
-    by_discovery = block_means(np.broadcast_to(summed(terms), 10 * n), 10)[moving]
+    force = system.sum(on_grid(ride).quantities, values, 0.1, *ROAD_LOAD)
+    by_discovery = block_means(np.broadcast_to(force, 10 * n), 10)[moving]
     assert by_discovery == pytest.approx(held, rel=1e-6)
 
 

@@ -1,0 +1,956 @@
+"""From the causes that a search found to a report: how sure, what could replace them, what has no name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.constants import WH_PER_KM
+from gz_onboard.discovery.channels import CHANNEL, CHANNELS, ROLLING, Channel
+from gz_onboard.discovery.curves import (
+    CONSTANT,
+    KNOTS,
+    CurveFit,
+    CurveForm,
+    columns_of,
+    curve_form,
+    curve_forms,
+    fit_curve,
+)
+from gz_onboard.discovery.grid import STEP
+from gz_onboard.discovery.mixed_model import LinearRide, MixedModel, Posterior
+from gz_onboard.discovery.parameters import EACH_RIDES_OWN, LOG_SCALED, NUISANCE, Candidate, stepped
+from gz_onboard.discovery.search import (
+    IMPOSSIBLE,
+    Search,
+    Split,
+    carries_over,
+    held_out,
+    improves,
+    one_degree,
+    splits,
+    with_observed_scatter,
+    within_bounds,
+)
+from gz_onboard.errors import brief
+from gz_onboard.reports.results import OPTIONAL
+
+VERSION = 3  # of the keys
+VERDICTS = {
+    "cause": "Fault identified",
+    "none": "No fault found that these rides could show",
+    "ambiguous": "Fault found, but these rides cannot tell which of several causes it is",
+    "unknown": "Fault found that is none of the candidates",
+    "inconclusive": "The model misses rides held out by more than healthy rides, and no cause explains it",
+}
+METRICS = {
+    "power": ("power, rms", 1.0, "W"),
+    "consumption": ("consumption", 1 / WH_PER_KM, "Wh/km"),
+    "range": ("range", 100.0, "%"),
+    "voltage": ("voltage of a cell", 1e3, "mV"),
+}
+"""Of the gain: label, factor and unit."""
+RIDE_TO_RIDE = "ride"  # the quantity of an error that differs from ride to ride
+POWER_CHANNELS = ("road_force", "inverter_power", "pack_power", "auxiliary", "pack_balance")
+"""Channels whose residual is a power at the terminals of the pack."""
+LUMPED = dict.fromkeys(("motor_temperature", "inverter_temperature", "cell_temperature"), 3) | dict.fromkeys(
+    ("cell_voltage", "voltage_timing"), 1
+)
+"""Channels whose model is a network of lumps or a circuit: how much more than others they err, in shares."""
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class JudgementConfig:
+    """What counts as sure, as alike, as much."""
+
+    discrepancy: float = 0.05  # sd of a change, as a share: no effect has exactly its real form
+    least_alternative: float = 0.4  # of the threshold, that a replacement must explain by itself
+    margin: float = 6.0  # of chi-squared: a likelihood ratio of 20
+    look_alike: float = 0.8  # cosine of two candidates
+    left: float = 0.1  # of the evidence for the causes: a curve beside them with less is the bend of a large effect
+    unlike_left: float = 0.004  # the same where the curve contradicts them
+    curve: float = 1.5  # evidence for a curve over that for a cause: its knots were chosen by eye
+    unlike: float = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not its bend
+    rival: float = 0.25  # of the evidence for the causes of its channel, likewise
+    clear: float = 4.0  # standard deviations of a value of a curve
+    own_share: float = 0.3  # of the evidence for a cause: a channel with more names it
+    weighty: float = 0.02  # of the rides at a knot that can contradict
+    acting: float = 0.1  # of the most that causes do: where they do less they do not act
+    better: float = 15.0  # of chi-squared, less 2 for each further knot, by which a curve beats a cause
+    far_beyond: float = 10.0  # times the threshold: the score of an impossible candidate that is no chance
+    most_refitted: float = 0.25  # of the energy: healthy rides refit a tenth against the file alone
+    bootstrap: int = 400  # draws over rides
+    missed: float = 0.05  # of the range or the energy
+    healthy_most: float = 0.08  # of it: of 40 healthy sets none misses more than 5.4 %, against its file 7.1 %
+    other_radius: float = 1.1  # no tyre changes its radius by as much
+    outstanding: float = 3.5  # standard deviations of a ride from healthy ones
+
+
+JUDGE = JudgementConfig()
+
+
+# --- the report -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A parameter's value once accepted, with its 95 % interval."""
+
+    value: float
+    ci95: Interval
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class FoundCause:
+    """A cause that was named, with the value of its first parameter and its change over the healthy one.
+
+    evidence: chi-squared of one degree of freedom. varies: from ride to ride, by itself or as rides held out show; no
+    model is extended with it. parameters: all of them.
+    """
+
+    name: str
+    parameter: str
+    value: float
+    unit: str
+    ci95: Interval
+    change: float
+    energy_share: float
+    evidence: float
+    varies: bool = False
+    parameters: dict[str, ParameterEstimate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A difference without a name: a curve that a `channel` leaves over a `quantity`, `RIDE_TO_RIDE` or a `CONSTANT`.
+
+    straight: in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it refutes.
+    share: of the energy.
+    """
+
+    channel: str
+    quantity: str
+    straight: bool
+    unit: str
+    score: float
+    chi2: float
+    curve: tuple[tuple[float, float, float], ...]
+    denies: tuple[str, ...] = ()
+    share: float = 0.0
+
+    def __str__(self) -> str:
+        if self.quantity != CONSTANT:
+            return f"{readable(self.channel)} over {readable(self.quantity)}"
+        ((_, value, sd),) = self.curve
+        return f"a constant {readable(self.channel)}, {value:+.4g} ± {sd:.2g} {CHANNEL[self.channel].unit} everywhere"
+
+
+@dataclass(frozen=True)
+class Impossible:
+    """A candidate whose evidence asks for a value of its first parameter beyond its bounds, and the energy it takes."""
+
+    name: str
+    parameter: str
+    value: float
+    unit: str
+    bounds: Interval
+    score: float
+    energy_share: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name} (score {self.score:.0f}, {self.energy_share:+.1%} of the energy) would explain the rides "
+            f"with {self.parameter} = {with_unit(self.value, self.unit)}, beyond its bounds of {self.bounds[0]:g} to "
+            f"{self.bounds[1]:g}"
+        )
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A parameter without a cause, before the rides and refitted to them. stated: not missing in the vehicle file."""
+
+    parameter: str
+    known: float
+    value: float
+    unit: str
+    energy_share: float
+    stated: bool
+
+    def __str__(self) -> str:
+        missing = "" if self.stated else " (not in the vehicle file)"
+        value = with_unit(self.value, self.unit)
+        return f"{self.parameter} {self.known:.4g} to {value}, {self.energy_share:+.1%}{missing}"
+
+
+@dataclass(frozen=True)
+class Strain:
+    """Implausible explanations of the rides: parameters without a cause whose refit takes a large `energy_share`, and
+    candidates at impossible values.
+    """
+
+    energy_share: float
+    refitted: tuple[Refitted, ...]
+    impossible: tuple[Impossible, ...]
+
+    def sentences(self) -> list[str]:
+        """One sentence for each."""
+        found = [str(row) for row in self.impossible]
+        if self.refitted:
+            found.append(
+                f"parameters without a cause took {self.energy_share:+.1%} of the energy in the refit, which is "
+                f"implausible: {'; '.join(map(str, self.refitted))}"
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score of a candidate beside the causes named."""
+
+    name: str
+    score: float
+
+
+@dataclass(frozen=True)
+class ResidualSize:
+    """Size of a channel's residual, in its unit. autocorrelation: of neighbouring blocks."""
+
+    mean: float
+    rms: float
+    autocorrelation: float
+    blocks: int
+    energy_share: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors on rides held out: before, with the present parameters refitted, after.
+
+    ci95: of control minus after; None for one ride.
+    """
+
+    before: float
+    control: float
+    after: float
+    ci95: Interval | None
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Errors on rides held out of the fit. apart: these rides had no part in the choice either.
+
+    voltage: of a cell [V]; power: rms [W]; consumption: [J/m]; range: [1].
+    """
+
+    holdout: tuple[str, ...] = ()
+    note: Annotated[str | None, OPTIONAL] = None
+    apart: Annotated[bool | None, OPTIONAL] = None
+    voltage: Annotated[Errors | None, OPTIONAL] = None
+    power: Annotated[Errors | None, OPTIONAL] = None
+    consumption: Annotated[Errors | None, OPTIONAL] = None
+    range: Annotated[Errors | None, OPTIONAL] = None
+
+    @property
+    def errors(self) -> dict[str, Errors]:
+        """The metrics that were measured, in the order of `METRICS`."""
+        return {name: found for name in METRICS if (found := getattr(self, name)) is not None}
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """Which causes could be told apart. signatures: channels that depend on each candidate (Krysander & Frisk 2008).
+
+    look_alikes: pairs that these rides can hardly separate, and the cosine of their effects on the residuals.
+    """
+
+    signatures: dict[str, list[str]]
+    look_alikes: list[tuple[str, str, float]]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The smallest change of a cause's first parameter that these rides would show half the time, were it alone.
+
+    energy_share: as a magnitude. Both None if it is not identifiable. needs: roles that show it, any set of them.
+    """
+
+    parameter: str
+    unit: str
+    change: float | None
+    energy_share: float | None
+    needs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """The result of a discovery."""
+
+    version: int = field(default=VERSION, init=False)
+    verdict: Annotated[str, "cause, none, ambiguous, unknown or inconclusive"]
+    causes: Annotated[
+        list[FoundCause],
+        "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence (chi-squared of "
+        "one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all of them: "
+        "value, ci95, unit)",
+    ]
+    ambiguous: Annotated[list[list[str]], "sets of names that these rides cannot tell apart, the likeliest first"]
+    unknown: Annotated[
+        Unknown | None,
+        "a difference without a name: channel, quantity, unit, straight (in proportion), share of the energy, curve "
+        "[[at, value, sd], ...], denies (causes that it refutes); or null",
+    ]
+    ranking: Annotated[list[Score], "name, score of every candidate beside the causes named"]
+    residuals: Annotated[dict[str, ResidualSize], "per channel: mean, rms, autocorrelation, blocks, energy_share"]
+    gain: Annotated[
+        Gain,
+        "on rides held out: holdout, and per metric before, control (present parameters refitted), after, ci95 (of "
+        "control minus after, over rides); apart: whether these rides had no part in the choice either",
+    ]
+    extended_model: Annotated[str | None, "the vehicle file written, or null"] = field(default=None)
+    advice: Annotated[list[str], "what to ride next"] = field(default_factory=list)
+    notes: Annotated[list[str], "what could not be used, and what was left out"] = field(default_factory=list)
+    isolability: Annotated[
+        Isolability,
+        "signatures: channels of each candidate; look_alikes: pairs and the cosine of their effects on the residuals",
+    ] = field(default_factory=lambda: Isolability({}, []))
+    threshold: Annotated[float, "score that one in twenty such searches of healthy rides exceeds"] = math.nan
+    constancy: Annotated[
+        list[Split],
+        "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves of the "
+        "quantity over the mean), chi2",
+    ] = field(default_factory=list)
+    strain: Annotated[
+        Strain | None,
+        "implausible explanations: energy_share of all that was refitted, refitted (the parameters that took most), "
+        "impossible (candidates at values beyond their bounds); or null",
+    ] = None
+    limits: Annotated[
+        dict[str, Limit],
+        "per candidate: parameter, change, unit, energy_share: the least that would be found half the time; needs: the "
+        "roles that show it, any set of them",
+    ] = field(default_factory=dict)
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """A report, and the search that it was reached on."""
+
+    report: Report
+    search: Search
+
+    __repr__ = brief
+
+
+def with_unit(value: float, unit: str, form: str = ".4g") -> str:
+    """A value with its unit; that of a pure number is left out."""
+    return f"{value:{form}}" if unit == "1" else f"{value:{form}} {unit}"
+
+
+def readable(name: str) -> str:
+    """A name of the code in words."""
+    return name.replace("_", " ").replace("gps", "GPS")
+
+
+# --- energy ---------------------------------------------------------------------------------------------------------
+
+
+def power_per_residual(line: LinearRide, name: str) -> Array | None:
+    """The factor (m,) from a channel's residual to power at the pack's terminals [W]; None if it is no power."""
+    table = line.tables[name]
+    if name == "road_force":
+        return np.asarray(table.unit * table.over(line.ride.quantities["speed"]))
+    if name == "pack_balance":
+        volts = line.ride.signals.get("pack_voltage")
+        return None if volts is None else np.asarray(table.unit * table.over(volts))
+    return table.unit if name in POWER_CHANNELS else None
+
+
+def channel_energy(line: LinearRide, name: str, values: Array) -> Array:
+    """Residuals (m,) or (m, k) of a channel as energy at the pack's terminals over the ride [J]; 0 if no power."""
+    factor = power_per_residual(line, name)
+    if factor is None or not len(factor):
+        return np.zeros(values.shape[1:])
+    time = len(line.ride.time) * STEP
+    if name == "road_force":  # the residual holds where the wheel rolls
+        time *= float(np.mean(np.abs(line.ride.quantities["speed"]) > ROLLING))
+    return np.asarray(factor @ values / len(factor) * time)
+
+
+def energy_per_change(line: LinearRide, channels: Sequence[str] = POWER_CHANNELS) -> Array:
+    """Energy at the pack's terminals [J] for a change of each parameter by its scale, (p,)."""
+    found = (channel_energy(line, name, line.tables[name].a) for name in channels if name in line.tables)
+    return np.asarray(sum(found, np.zeros(line.statistics.score.shape)))
+
+
+def energy_share(lines: Sequence[LinearRide], change: Array, channels: Sequence[str] = POWER_CHANNELS) -> float:
+    """The share of the energy drawn that `change` (p,) of the parameters makes over these rides."""
+    drawn = sum(line.ride.energy for line in lines)
+    return float(sum(energy_per_change(line, channels) @ change for line in lines)) / drawn if drawn else 0.0
+
+
+def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
+    """The size of each channel's residual."""
+    result, drawn = {}, sum(line.ride.energy for line in lines)
+    for name in sorted({name for line in lines for name in line.tables}):
+        rows = [(line, line.tables[name].y) for line in lines if name in line.tables]
+        y = np.concatenate([y for _, y in rows])
+        late, early = (np.concatenate([y[part] for _, y in rows]) for part in (slice(1, None), slice(None, -1)))
+        correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
+        share = float(sum(channel_energy(line, name, y) for line, y in rows)) / drawn if drawn else 0.0
+        result[name] = ResidualSize(float(y.mean()), float(np.sqrt(np.mean(y**2))), correlation, len(y), share)
+    return result
+
+
+def errors(line: LinearRide, theta: Array) -> dict[str, float]:
+    """The metrics of `Gain` of one ride with parameters `theta` (p,), as far as they are known."""
+    more, square = 0.0, 0.0
+    found: dict[str, float] = {}
+    for name, table in line.tables.items():
+        rest = table.y - table.a @ theta
+        factor = power_per_residual(line, name)
+        if factor is not None and len(factor):
+            more += float(channel_energy(line, name, rest))
+            square += float(np.mean((factor * rest) ** 2))
+        if name == "cell_voltage":
+            found["voltage"] = float(np.sqrt(np.mean(rest**2)))
+    found["power"] = float(np.sqrt(square))
+    found["consumption"] = abs(more) / max(line.ride.distance, 1.0)
+    model = line.ride.energy - more
+    if line.ride.have >= {"pack_voltage", "pack_current"} and model > 0:
+        found["range"] = abs(more) / model
+    return found
+
+
+# --- differences without a name -------------------------------------------------------------------------------------
+
+
+def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
+    """The curve that explains most beside the causes chosen, and which of them it refutes; None without one.
+
+    A curve refutes causes if it takes back, or adds, half or more of their effect somewhere in a channel that names
+    them, if it has a quarter of their evidence beside them, if it explains much more than one of them in its place, or
+    if `constancy` finds one unequal. Other causes must then be significant without the refuted ones.
+    """
+    best = best_curve(now)
+    if best is None or not best.denies:
+        best = rival_curve(now) or best
+    uneven = [split for split in constancy if split.unequal]
+    if uneven and (best is None or not best.denies):
+        worst = max(uneven, key=lambda split: split.chi2)
+        best = curve_over_split(now, worst) or ride_to_ride(now, worst, constancy)
+    if best is None or not best.denies:
+        return best
+    denied = dict.fromkeys([*best.denies, *(split.cause for split in uneven)])
+    left = [name for name in now.chosen if name not in denied]
+    least = max(now.limit, JUDGE.left * best.chi2)
+    denied |= dict.fromkeys(name for name in left if now.part(left, name) < least)
+    return replace(best, denies=tuple(denied))
+
+
+def curves_beside(
+    now: Search, chosen: Sequence[str], forms: Sequence[CurveForm]
+) -> Iterator[tuple[CurveForm, CurveFit, float]]:
+    """Each of `forms` that the rides show beside the causes `chosen`, with its chi-squared on healthy rides."""
+    for form in forms:
+        curve = fit_curve(now.mixed, now.lines, form, now.index(chosen))
+        if curve is not None:
+            yield form, curve, healthy_chi2(now.mixed, form, curve)
+
+
+def healthy_chi2(mixed: MixedModel, form: CurveForm, curve: CurveFit) -> float:
+    """The chi-squared of a curve over its inflation on healthy rides."""
+    healthy = mixed.shapes.get(form.name)
+    return curve.chi2 / (healthy.inflation if healthy else 1.0)
+
+
+def is_significant(now: Search, form: CurveForm, curve: CurveFit) -> bool:
+    """Whether a curve has the score that it must have; a straight line counts as a try of its own instead."""
+    score = one_degree(healthy_chi2(now.mixed, form, curve), curve.k, now.mixed.freedom)
+    return score >= now.limit * (1.0 if form.straight else JUDGE.curve)
+
+
+def best_curve(now: Search) -> Unknown | None:
+    """The curve that explains most beside the causes chosen, and those of its channel if it is no bend of theirs."""
+    total, best = now.evidence.gain(now.index(now.chosen)), None
+    for form, curve, chi2 in curves_beside(now, now.chosen, curve_forms(now.mixed.system.sizes)):
+        if not is_significant(now, form, curve):
+            continue
+        mine = [name for name in now.chosen if now.shares[name].get(form.channel, 0.0) > JUDGE.own_share]
+        theirs = sum(now.part(now.chosen, name) for name in mine)
+        unlike = contradicts_causes(now, form, curve, chi2) or bool(mine and chi2 > JUDGE.rival * theirs)
+        if now.chosen and curve.chi2 < (JUDGE.unlike_left if unlike else JUDGE.left) * total:
+            continue
+        found = described(now, form, curve, mine if unlike else [])
+        if best is not None and (unlike, found.score) <= (bool(best.denies), best.score):
+            continue
+        if is_accepted(now, form, [name for name in now.chosen if name not in found.denies]):
+            best = found
+    return best
+
+
+def is_accepted(now: Search, form: CurveForm, rest: Sequence[str]) -> bool:
+    """Whether a curve beside the causes `rest` is more than these rides differ, and improves rides held out."""
+    wide = with_observed_scatter(now.mixed, now.lines)
+    curve = fit_curve(wide, now.lines, form, now.index(rest), own=True)
+    if curve is None or not is_significant(now, form, curve):
+        return False
+    causes = [now.causes[name] for name in rest]
+    return len(now.lines) < 2 or improves(held_out(now.mixed, now.lines, causes, causes, form), {form.channel: 1.0})
+
+
+def rival_curve(now: Search) -> Unknown | None:
+    """The curve that explains much better than one of the causes chosen, in its own channel."""
+    best, most = None, JUDGE.better
+    for name in now.chosen:
+        rest = [other for other in now.chosen if other != name]
+        own = now.step(rest, name)
+        forms = curve_forms(now.mixed.system.sizes)
+        mine = [form for form in forms if now.shares[name].get(form.channel, 0.0) >= JUDGE.own_share]
+        for form, curve, chi2 in curves_beside(now, rest, mine):
+            ahead = chi2 - 2 * (curve.k - 1) - own * max(now.mixed.inflation.get(name, 1.0), 1.0)
+            if ahead > max(most, JUDGE.unlike_left * own) and is_accepted(now, form, rest):
+                best, most = described(now, form, curve, [name]), ahead
+    return best
+
+
+def curve_over_split(now: Search, split: Split) -> Unknown | None:
+    """The curve over the quantity of `split`, with no cause named, in the channel where it explains most."""
+    forms = [f for f in curve_forms(now.mixed.system.sizes) if f.quantity == split.quantity and not f.straight]
+    found = [described(now, form, curve, [split.cause]) for form, curve, _ in curves_beside(now, [], forms)]
+    return max(found, key=lambda curve: curve.score, default=None)
+
+
+def ride_to_ride(now: Search, worst: Split, constancy: Sequence[Split]) -> Unknown:
+    """A cause that acts in some rides and not in others: how much more or less in each."""
+    channel = max((name for line in now.lines for name in line.tables), key=lambda name: channel_effect(now, name)[1])
+    mine = [split for split in constancy if split.cause == worst.cause and split.of_ride]
+    rows = tuple((float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5) for i, s in enumerate(mine))
+    share = energy_share(now.lines, now.change)
+    return Unknown(channel, RIDE_TO_RIDE, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
+
+
+def described(now: Search, form: CurveForm, curve: CurveFit, denies: Sequence[str]) -> Unknown:
+    """The curve for the report."""
+    score = one_degree(healthy_chi2(now.mixed, form, curve), curve.k, now.mixed.freedom)
+    sd = np.sqrt(np.abs(np.diag(curve.covariance)))
+    rows = tuple(zip(form.knots, curve.values.tolist(), sd.tolist(), strict=True))
+    more, drawn = 0.0, sum(line.ride.energy for line in now.lines)
+    for line in now.lines:
+        knots = columns_of(line, form)
+        if knots is not None:
+            values = knots @ curve.values / line.tables[form.channel].unit
+            more += float(channel_energy(line, form.channel, values))
+    share, unit = more / drawn if drawn else 0.0, KNOTS[form.quantity][1]
+    return Unknown(form.channel, form.quantity, form.straight, unit, score, curve.chi2, rows, tuple(denies), share)
+
+
+def contradicts_causes(now: Search, form: CurveForm, curve: CurveFit, chi2: float) -> bool:
+    """Whether a curve beside the causes is more than the bend of their effect in a channel that names them."""
+    size, share = channel_effect(now, form.channel)
+    if share <= JUDGE.own_share or size <= 0:
+        return False
+    value, sd = curve.contrasts()
+    certain = np.abs(value) > JUDGE.clear * sd * (curve.chi2 / max(chi2, 1e-12)) ** 0.5
+    return bool(np.any(np.abs(value)[certain & (curve.weights > JUDGE.weighty)] > JUDGE.unlike * size))
+
+
+def channel_effect(now: Search, channel: str) -> tuple[float, float]:
+    """(effect of the causes chosen in `channel`, rms where they act [unit]; the channel's share of the evidence)."""
+    change = now.change
+    parts, here, everywhere = [np.zeros(1)], 0.0, 0.0
+    for line in now.lines:
+        for name, table in line.tables.items():
+            effect = table.a @ change
+            strength = float(np.sum((effect / now.mixed.noise[name].sd) ** 2))
+            everywhere += strength
+            if name == channel:
+                here += strength
+                parts.append(np.abs(effect * table.unit))
+    effect = np.concatenate(parts)
+    acting = effect[effect > JUDGE.acting * effect.max()]
+    if effect.max() < 1e-9 or not len(acting):
+        return 0.0, 0.0
+    return float(np.sqrt(np.mean(acting**2))), here / everywhere
+
+
+def strain_of(now: Search, chosen: Sequence[str], scores: Mapping[str, float]) -> Strain | None:
+    """Implausible explanations beside the causes `chosen`, with `scores` of each candidate; None if there are none.
+
+    Two things explain rides away without a cause: a candidate whose evidence asks for a value that it cannot have is
+    not named, and parameters without a cause move in each fit, none of many perhaps beyond its prior, and yet together
+    they may take most of the energy. Then the vehicle, its file or a signal is wrong.
+    """
+    mixed = now.mixed
+    impossible = []
+    for row in now.rejected:
+        if row.why != IMPOSSIBLE or scores[row.name] <= JUDGE.far_beyond * now.limit:
+            continue
+        (cause,) = (cause for cause in mixed.causes if cause.name == row.name)
+        index, whole, first = mixed.index(cause.names), np.zeros(len(mixed.names)), cause.parameters[0]
+        whole[index] = row.change
+        value = stepped(first.name, mixed.values[first.name], float(whole[index[0]] * mixed.scale[index[0]]))
+        bounds, share = (first.low, first.high), energy_share(now.lines, whole)
+        impossible.append(Impossible(cause.name, first.name, value, first.unit, bounds, scores[row.name], share))
+    # of all parameters but those of causes, sensors and the start
+    causes, post = fitted(now, chosen)
+    drawn = sum(line.ride.energy for line in now.lines) or 1.0
+    moves = [post.mean + own - mixed.mean for own in post.own]
+    shares = np.sum([energy_per_change(x) * move for x, move in zip(now.lines, moves, strict=True)], axis=0) / drawn
+    judged = [i for i, name in enumerate(mixed.names) if i not in causes and name not in EACH_RIDES_OWN]
+    total = float(np.sum(shares[judged]))
+    if abs(total) <= JUDGE.most_refitted:
+        return Strain(total, (), tuple(impossible)) if impossible else None
+    known, before, rows = mixed.vehicle.parameters.known, mixed.values_at(mixed.mean), []
+    for i in sorted(judged, key=lambda i: -abs(shares[i]))[:4]:
+        name = mixed.names[i]
+        unit = NUISANCE[name].unit if name in NUISANCE else known[name].unit if name in known else ""
+        stated = name in NUISANCE or (name in known and not known[name].source.startswith("prior:"))
+        value = stepped(name, before[name], float((post.mean[i] - mixed.mean[i]) * mixed.scale[i]))
+        rows.append(Refitted(name, before[name], value, unit, float(shares[i]), stated))
+    return Strain(total, tuple(row for row in rows if abs(row.energy_share) > 0.02), tuple(impossible))
+
+
+def fitted(now: Search, causes: Sequence[str]) -> tuple[list[int], Posterior]:
+    """The places of the parameters of `causes`, and all parameters as the rides show them with these free."""
+    index = now.mixed.index_of(cause for cause in now.mixed.causes if cause.name in causes)
+    return index, now.mixed.freed(index).fit(now.lines)
+
+
+# --- causes ---------------------------------------------------------------------------------------------------------
+
+
+def causes_of(search: Search, chosen: Sequence[str]) -> list[FoundCause]:
+    """The chosen causes with values and intervals."""
+    mixed = search.mixed
+    result = []
+    for name, (own, variance) in search.fitted(chosen).items():
+        change = np.zeros(len(mixed.mean))
+        change[search.place[name]] = own
+        rows = intervals(search, name, own, np.sqrt(variance * mixed.inflation.get(name, 1.0)))
+        first = search.causes[name].parameters[0].name
+        value, ci95, unit = rows[first].value, rows[first].ci95, rows[first].unit
+        score, share = round(search.part(chosen, name), 2), energy_share(search.lines, change)
+        more = value - mixed.healthy_value(first)
+        result.append(FoundCause(name, first, value, unit, ci95, more, share, score, parameters=rows))
+    return result
+
+
+def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, ParameterEstimate]:
+    """The parameters of a cause after `change` (k,) [scales], known within `sd` and the error of the effect's form.
+
+    That error is twice as large in a circuit and four times as large in a network of lumps.
+    """
+    mixed, rows = search.mixed, {}
+    form = JUDGE.discrepancy * (1 + sum(LUMPED.get(c, 0) * share for c, share in search.shares[name].items()))
+    for parameter, i, x, s in zip(search.causes[name].parameters, search.place[name], change, sd, strict=True):
+        healthy, step = mixed.healthy_value(parameter.name), float(mixed.scale[i])
+        wide = mixed.quantile * float(np.hypot(s, form * x))
+        ends = [stepped(parameter.name, healthy, step * y) for y in (float(x), float(x) - wide, float(x) + wide)]
+        value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing impossible
+        rows[parameter.name] = ParameterEstimate(value, (low, high), parameter.unit)
+    return rows
+
+
+def alternatives(now: Search, chosen: Sequence[str]) -> list[list[str]]:
+    """For each cause chosen that others could replace: itself and these, if their parameters can have the values."""
+    sets, inflation = [], now.mixed.inflation
+    for name in chosen:
+        rest = [other for other in chosen if other != name]
+        own = now.gain([*rest, name])
+        near = {n: now.gain([*rest, n]) for n in now.causes if n not in chosen}
+        # the margin is on the scale of the less certain of the two
+        margin = {n: JUDGE.margin * max(1.0, inflation.get(n, 1.0), inflation.get(name, 1.0)) for n in near}
+        least = JUDGE.least_alternative * now.limit
+        others = [n for n, gain in near.items() if gain > own - margin[n] and now.step(rest, n) > least]
+        if not others:
+            continue
+        group = []
+        for n in (name, *sorted(others, key=lambda n: -near[n])):
+            change, variance = now.fitted([*rest, n])[n]
+            if within_bounds(now.mixed, now.causes[n], change, np.sqrt(variance)):
+                group.append(n)
+        if len(group) > 1:
+            sets.append(group)
+    return sets
+
+
+def separability(search: Search) -> Isolability:
+    """Which candidates that the rides show could be told apart."""
+    signatures = {
+        name: sorted(channel for channel, share in search.shares[name].items() if share > 0) for name in search.causes
+    }
+    first = [place[0] for place in search.place.values()]
+    information = search.evidence.information[np.ix_(first, first)]
+    scale = np.sqrt(np.abs(np.outer(np.diag(information), np.diag(information))))
+    cosines = np.divide(information, scale, out=np.zeros_like(scale), where=scale > 0)
+    names = list(search.causes)
+    pairs = [(i, j) for i in range(len(names)) for j in range(i + 1, len(names))]
+    pairs = [(i, j) for i, j in pairs if abs(cosines[i, j]) > JUDGE.look_alike]
+    alike = [(names[i], names[j], round(float(cosines[i, j]), 3)) for i, j in pairs]
+    return Isolability(signatures, sorted(alike, key=lambda row: -abs(row[2])))
+
+
+def showing(mixed: MixedModel, cause: Candidate) -> list[Channel]:
+    """The channels that depend on `cause`."""
+    return [channel for channel in CHANNELS if set(cause.names) & channel.depends(mixed.system.effects)]
+
+
+def needs(mixed: MixedModel, cause: Candidate) -> tuple[str, ...]:
+    """The roles that show `cause`, a text for each set of them, the shortest first."""
+    sets = {
+        " and ".join((*channel.roles, *channel.fed_by))
+        + (f" each {channel.apart:g} s or more often" if channel.apart < math.inf else "")
+        for channel in showing(mixed, cause)
+    }
+    return tuple(sorted(sets, key=lambda text: (text.count(" and "), text)))
+
+
+def limits(now: Search, order: Sequence[str]) -> dict[str, Limit]:
+    """The detection limit of every candidate, in the order of their names in `order`, then those not identifiable."""
+    mixed, result = now.mixed, {}
+    for cause in sorted(mixed.causes, key=lambda c: order.index(c.name) if c.name in order else len(order)):
+        parameter, required = cause.parameters[0], needs(mixed, cause)
+        (place,) = mixed.index([parameter.name]) if cause.name in order else (0,)
+        information = float(now.evidence.information[place, place])
+        if cause.name not in order or information <= 0:
+            result[cause.name] = Limit(parameter.name, parameter.unit, None, None, required)
+            continue
+        change = np.zeros(len(mixed.mean))
+        change[place] = np.sqrt(now.limit * mixed.inflation.get(cause.name, 1.0) / information)
+        unit = mixed.healthy_value(parameter.name) if parameter.name in LOG_SCALED else 1.0
+        steps, share = float(change[place] * mixed.scale[place]) * unit, abs(energy_share(now.lines, change))
+        result[cause.name] = Limit(parameter.name, parameter.unit, steps, share, required)
+    return result
+
+
+# --- gain on rides held out -----------------------------------------------------------------------------------------
+
+
+def measure_gain(
+    now: Search, causes: Sequence[FoundCause], unknown: Unknown | None, seed: int, apart: Sequence[LinearRide]
+) -> Gain:
+    """Errors of rides that were not fitted, with the `causes` and the curve of `unknown` and without.
+
+    seed: of the bootstrap over rides. apart: rides that had no part in the search. Without any, each of its rides is
+    held out in turn; the choice of the causes is then shared.
+    """
+    mixed, lines, known = now.mixed, [*now.lines, *apart], len(now.lines)
+    if len(lines) < 2:
+        return Gain(note="one ride: nothing to hold out")
+    folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
+    named = {cause.name for cause in causes if not cause.varies}
+    after = [cause for cause in mixed.causes if cause.name in named]
+    form = None
+    if unknown is not None and unknown.quantity != RIDE_TO_RIDE:
+        form = curve_form(unknown.channel, unknown.quantity, unknown.straight, mixed.system.sizes)
+    rows: dict[str, list[list[float]]] = {}
+    for models in held_out(mixed, lines, after, form=form, folds=folds):
+        each = [errors(line, theta) for line, theta in models]
+        for metric in each[0]:
+            rows.setdefault(metric, []).append([found[metric] for found in each])
+    rng = np.random.default_rng(seed)
+    held = tuple(lines[i].ride.name for fold in folds for i in fold)
+    return Gain(held, None, bool(apart), **{metric: summarised(np.array(table), rng) for metric, table in rows.items()})
+
+
+def summarised(table: Array, rng: np.random.Generator) -> Errors:
+    """The means of (rides, 3) errors, and the interval of the gain by a bootstrap over rides."""
+    before, control, after = table.mean(axis=0).tolist()
+    if len(table) < 2:
+        return Errors(before, control, after, None)
+    draws = rng.integers(0, len(table), (JUDGE.bootstrap, len(table)))
+    low, high = np.quantile((table[:, 1] - table[:, 2])[draws].mean(axis=1), [0.025, 0.975])
+    return Errors(before, control, after, (float(low), float(high)))
+
+
+def remaining_error(gain: Gain, lines: Sequence[LinearRide]) -> tuple[str, float]:
+    """(of what, the share) that is missed on rides held out: the range, or the energy where the pack's is unknown."""
+    if gain.range is not None:
+        return "range", gain.range.after
+    energy, distance = (sum(getattr(line.ride, name) for line in lines) for name in ("energy", "distance"))
+    if gain.consumption is not None and energy > 0:
+        return "energy", gain.consumption.after * distance / energy
+    return "", 0.0
+
+
+# --- the judgement --------------------------------------------------------------------------------------------------
+
+
+def judge(
+    problem: Search, now: Search, notes: Sequence[str] = (), seed: int = 0, apart: Sequence[LinearRide] = ()
+) -> Discovery:
+    """The report on `now`, the accepted causes of `problem`.
+
+    notes: so far. seed: of the bootstrap. apart: rides, linearised where `now` is, that only the gain is measured on.
+    """
+    constancy = splits(now)
+    unknown = unexplained(now, constancy)
+    chosen = tuple(name for name in now.chosen if unknown is None or name not in unknown.denies)
+    every = replace(now, causes=problem.causes)
+    found = [replace(cause, varies=not carries_over(now, cause.name)) for cause in causes_of(now, chosen)]
+    sets = alternatives(now, chosen)
+    scores = {name: every.part(chosen, name) for name in every.causes}
+    notes = [*notes, *unseen(problem), *map(str, now.rejected)]
+    if now.winds is not None:
+        name = now.winds.cause.name
+        scores[name] = max(scores.get(name, 0.0), now.winds.score)
+        if now.winds.score > now.limit:  # the vector that they have in common is named
+            (wind,) = causes_of(every, [*chosen, name])[-1:]
+            found.append(replace(wind, evidence=round(now.winds.score, 2), varies=True))
+            notes.append("the wind differed from ride to ride: " + now.winds.words)
+    gain = measure_gain(now, found, unknown, seed, apart)
+    if unknown is not None and found and not unknown.denies:
+        plain = measure_gain(now, found, None, seed, apart)
+        metric = "voltage" if unknown.channel == "cell_voltage" else "power"
+        without, with_it = plain.errors.get(metric), gain.errors.get(metric)
+        if without is not None and with_it is not None and without.after <= with_it.after:
+            notes.append(f"{unknown} beside the causes is no better known on rides held out: left alone")
+            unknown, gain = None, plain
+    strain = strain_of(now, chosen, scores)
+    what, missed = remaining_error(gain, now.lines)
+    verdict = "ambiguous" if sets else "cause" if found else "none"
+    if not found and (unknown is not None or strain is not None):
+        verdict = "unknown"
+    if verdict == "none" and missed > JUDGE.healthy_most:
+        verdict = "inconclusive"
+    if missed > JUDGE.missed:
+        limit = f"(healthy rides: up to {JUDGE.healthy_most:.0%})"
+        notes.append(f"{missed:.0%} of the {what} is missed on rides held out {limit}")
+    ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
+    report = Report(
+        verdict=verdict,
+        causes=found,
+        ambiguous=sets,
+        unknown=unknown,
+        ranking=ranking,
+        residuals=residual_sizes(now.lines),
+        gain=gain,
+        advice=advice(now, sets, unknown, strain, verdict),
+        notes=[*notes, *outlying_rides(now, found), *implausible_rides(now.lines), *missing_residuals(now)],
+        isolability=separability(every),
+        threshold=now.limit,
+        constancy=constancy,
+        strain=strain,
+        limits=limits(now, [row.name for row in ranking]),
+    )
+    return Discovery(report, now)
+
+
+def advice(
+    now: Search, sets: Sequence[Sequence[str]], unknown: Unknown | None, strain: Strain | None, verdict: str
+) -> list[str]:
+    """What to ride next."""
+    lines = []
+    if strain is not None:
+        guessed = ", ".join(row.parameter for row in strain.refitted if not row.stated)
+        lines.append(
+            (f"Give what the file does not say ({guessed}). " if guessed else "")
+            + "Vehicle, vehicle file or a signal: these rides cannot tell which is wrong. A wrong unit, sign or scale "
+            "is found by `gz-onboard vehicle check`."
+        )
+    for group in sets:
+        shown = " ".join(now.causes[name].shown_by for name in group[:2])
+        lines.append(f"To tell {', '.join(group)} apart: {shown}")
+    if unknown is not None and unknown.quantity == RIDE_TO_RIDE:
+        lines.append(f"Ride one and the same way several times: the {readable(unknown.channel)} differs between rides.")
+    elif unknown is not None and unknown.quantity == CONSTANT:
+        lines.append(
+            f"Stand with the vehicle switched on, and ride at several steady speeds, for minutes each: a constant "
+            f"{unknown.channel} is one at all of them. A current sensor whose zero is off would show one too."
+        )
+    elif unknown is not None:
+        lines.append(
+            f"Ride over the whole span of {unknown.quantity} with all else the same, twice: the residual of "
+            f"{unknown.channel} goes with it, or with a quantity that changes along with it."
+        )
+    if verdict == "inconclusive":
+        lines.append(
+            "Ride one way there and back, on a calm day and on others: an error that differs from ride to ride, as "
+            "wind does, shows in rides that have all else in common."
+        )
+    return lines
+
+
+# --- notes ----------------------------------------------------------------------------------------------------------
+
+
+def unseen(problem: Search) -> list[str]:
+    """A note on the candidates that are not identifiable, and one on each that no ride has the sensors for."""
+    mixed = problem.mixed
+    blind = [cause for cause in mixed.causes if cause.name not in problem.causes]
+    there = {name for line in problem.lines for name in line.tables}
+    lacking = [cause for cause in blind if not there & {channel.name for channel in showing(mixed, cause)}]
+    notes = [f"{c.name} was not looked for: it needs {', or '.join(needs(mixed, c)) or 'a battery'}" for c in lacking]
+    rest = [cause.name for cause in blind if cause not in lacking]
+    verb = "is" if len(rest) == 1 else "are"
+    return [*([f"{', '.join(rest)} {verb} not identifiable from these rides"] if rest else []), *notes]
+
+
+def outlying_rides(now: Search, causes: Sequence[FoundCause]) -> list[str]:
+    """A sentence on each ride that differs from healthy ones by much: it may be the day, such as wind, or the ride."""
+    index, post = fitted(now, [cause.name for cause in causes])
+    sentences = []
+    for line, own in zip(now.lines, post.own, strict=True):
+        beyond = own / np.sqrt(now.mixed.scatter)
+        beyond[index] = 0.0
+        far = sorted(np.flatnonzero(np.abs(beyond) > JUDGE.outstanding), key=lambda i: -abs(beyond[i]))
+        if far:
+            most = ", ".join(f"{readable(now.mixed.names[i])} {beyond[i]:+.1f}" for i in far[:3])
+            sentences.append(f"{line.ride.name} is an outlier: {most} standard deviations")
+    return sentences
+
+
+def implausible_rides(lines: Sequence[LinearRide]) -> list[str]:
+    """A sentence on each ride whose GPS speed contradicts that of the motor: it may be another vehicle's."""
+    found = []
+    for line in lines:
+        s, speed = line.ride.signals, np.abs(line.ride.quantities["speed"])
+        if "gps_speed" not in s or not np.any(moving := speed > 5.0):
+            continue
+        ratio = float(np.median(s["gps_speed"][moving] / speed[moving]))
+        if not 1 / JUDGE.other_radius < ratio < JUDGE.other_radius:
+            found.append(
+                f"{line.ride.name}: GPS speed is {ratio:.2f} times the speed by motor speed and wheel radius; is this "
+                "a ride of this vehicle?"
+            )
+    return found
+
+
+def missing_residuals(now: Search) -> list[str]:
+    """Measurements that the rides do not have, and the residuals that this costs, a sentence for each set."""
+    rides = [line.ride for line in now.lines]
+    channels = [c for c in CHANNELS if now.mixed.system.battery is not None or not c.battery]
+    asked = [(channel.roles, readable(channel.name)) for channel in channels]
+    asked += [(("rate_z",), "residual over lateral acceleration"), (("gps_course",), "anything over heading")]
+    lost: dict[tuple[str, ...], dict[str, None]] = {}
+    for roles, words in asked:
+        for ride in rides:
+            if lacking := tuple(role for role in roles if role not in ride.have):
+                lost.setdefault(lacking, {})[words] = None
+    sentences = []
+    for roles, names in lost.items():
+        without = [ride.name for ride in rides if not set(roles) <= ride.have]
+        which = "no ride has" if len(without) == len(rides) else f"{', '.join(without)}: without"
+        sentences.append(f"{which} {' and '.join(roles)}: no {', no '.join(names)} there")
+    sentences += dict.fromkeys(words for ride in rides for words in ride.stand_ins)
+    for channel in channels:
+        if any(set(channel.roles) <= ride.have and channel.too_slow(ride) for ride in rides):
+            sentences.append(
+                f"samples of {' and '.join(channel.roles)} are further apart than {channel.apart:g} s: no "
+                f"{readable(channel.name)} there"
+            )
+    if any("pack_power" in line.tables for line in now.lines):
+        sentences.append(
+            "instead, the pack's power (voltage times current) is compared with drive and auxiliaries, as measured or "
+            "by their models: causes that act alike in it are told apart by speed, acceleration and grade alone"
+        )
+    return sentences
