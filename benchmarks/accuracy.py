@@ -134,7 +134,7 @@ def soc_table(results: list[tuple[str, list[Sample]]]) -> None:
     for name, samples in results:
         groups.setdefault(name.rpartition("_")[0], []).append(samples)
     print("| rides | number | worst error | worst error over sigma | innovation, mV RMS a cell |")
-    print("| --- | --- | --- | --- | --- |")
+    print("|---|---|---|---|---|")
     for name, rides in groups.items():
         worst = max((x.soc - x.reference for s in rides for x in s), key=abs)
         sigmas = max(abs(x.soc - x.reference) / x.soc_sd for s in rides for x in s)
@@ -144,7 +144,7 @@ def soc_table(results: list[tuple[str, list[Sample]]]) -> None:
 
 def range_table(results: list[tuple[str, list[Sample]]]) -> None:
     print("| ride | at SOC | ridden, km | ours, km (P10 to P90) | error | 25 km mean, 15 % kept | 25 km mean, to 0 % |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("|---|---|---|---|---|---|---|")
     for name, s in results:
         total, end = s[-1].distance, s[-1].used
         for level in (0.8, 0.5, 0.2):

@@ -142,7 +142,7 @@ def _rms(values: Iterable[float]) -> float:
 def report(trips: Sequence[Trip]) -> list[str]:
     groups = {name: [t for t in trips if t.held_out == held] for name, held in GROUPS.items()}
     head = " | ".join(f"{name} ({len(mine)} trips)" for name, mine in groups.items())
-    lines = [f"| | aim | {head} |", "| --- | --- | --- | --- |"]
+    lines = [f"| | aim | {head} |", "|---|---|---|---|"]
     for text, aim, figure in FIGURES:
         lines.append(f"| {text} | {aim} | {' | '.join(figure(mine) for mine in groups.values())} |")
     return lines

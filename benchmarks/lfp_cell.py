@@ -96,7 +96,7 @@ def report(folder: Path) -> list[str]:
     lines += [
         "| °C | start | RMS, % | largest | " + " | ".join(f"RMS {part}" for part in PARTS) + " | σ, % | within 95 % "
         "| NEES | to within 3 %, at SOC |",
-        "| --- " * (8 + len(PARTS)) + "|",
+        "|---" * (8 + len(PARTS)) + "|",
     ]
     for (_, _, test, wrong), (error, sd, truth) in zip(runs, results, strict=True):
         near = np.flatnonzero(np.abs(error) < NEAR)

@@ -282,7 +282,7 @@ def error_percent(rows: Sequence[Row], name: str) -> Array:
 
 def median_table(groups: Mapping[str, Sequence[Judged]]) -> list[str]:
     """Median error of every estimator, a row for each group of discharges."""
-    lines = ["| discharges | " + " | ".join(NAMES.values()) + " |", "| --- " * (len(NAMES) + 1) + "|"]
+    lines = ["| discharges | " + " | ".join(NAMES.values()) + " |", "|---" * (len(NAMES) + 1) + "|"]
     for title, judged in groups.items():
         rows = judged_rows(judged)
         cells = [f"{np.median(np.abs(error_percent(rows, name))):.1f}" for name in NAMES]
@@ -292,7 +292,7 @@ def median_table(groups: Mapping[str, Sequence[Judged]]) -> list[str]:
 
 def interval_table(groups: Mapping[str, Sequence[Judged]], name: str) -> list[str]:
     """Tails, interval, score and jumps of one of our estimators, a row for each group of discharges."""
-    lines = ["| discharges | 90 % | bias | held | width, % | CRPS, km | jumps, km |", "| --- " * 7 + "|"]
+    lines = ["| discharges | 90 % | bias | held | width, % | CRPS, km | jumps, km |", "|---" * 7 + "|"]
     for title, judged in groups.items():
         rows = judged_rows(judged)
         error = error_percent(rows, name)
@@ -311,7 +311,7 @@ def week_table(days: Sequence[Day]) -> list[str]:
     lines = [
         "| week | ridden, km | ridden, Wh/km | from the third day on expected, Wh/km | median error of that, % | "
         "largest SOC error, points |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "|---|---|---|---|---|---|",
     ]
     for week in sorted({x.week for x in days}):
         some = [x for x in days if x.week == week]

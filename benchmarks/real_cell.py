@@ -386,7 +386,7 @@ def _tables(result: Result) -> list[str]:
         "",
         "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s "
         "| errs by, mV, for, s |",
-        "| --- " * 8 + "|",
+        "|---" * 8 + "|",
     ]
     soc = c["battery.r0"].axes["soc"]
     k = int(np.argmin(np.abs(soc - 0.5)))
@@ -409,7 +409,7 @@ Scores = dict[tuple[str, Cycle, Case], Score]
 def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict[tuple[str, Cycle], Case]) -> list[str]:
     lines = [
         "| °C | start | σ, % | samples within 95 %, least of a cycle | NEES | s to within 3 %, most of a cycle |",
-        "| --- " * 6 + "|",
+        "|---" * 6 + "|",
     ]
     groups = {f"{t}": [c for c in work if c.temperature == t and "trise" not in c.name] for t in TEMPERATURES}
     groups["rising"] = [c for c in work if "trise" in c.name]
@@ -429,7 +429,7 @@ def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict
 
 
 def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: list[Case]) -> list[str]:
-    lines = ["| model | start | " + " | ".join(f"{t} °C" for t in TEMPERATURES) + " |", "| --- " * 7 + "|"]
+    lines = ["| model | start | " + " | ".join(f"{t} °C" for t in TEMPERATURES) + " |", "|---" * 7 + "|"]
     for setting in every:
         for case in cases:
             cells = []
@@ -453,7 +453,7 @@ def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]
     heads = ["below -1 A", "-1 to 0.3 A", "0.3 to 1.5 A", "1.5 to 4 A", "4 to 8 A", "above 8 A"]
     lines = [
         "| °C | one pair: RMS (mean) | two pairs: RMS (mean) | " + " | ".join(heads) + " |",
-        "| --- " * (3 + len(bins)) + "|",
+        "|---" * (3 + len(bins)) + "|",
     ]
     for t in TEMPERATURES:
         mine = [c for c in work if c.temperature == t]
@@ -476,7 +476,7 @@ def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]
 
 
 def _rates(tables: dict[int, Measurements], setting: Setting) -> list[str]:
-    lines = ["| °C | C/2 | 1 C | 2 C | 4 C | 6 C |", "| --- " * 6 + "|"]
+    lines = ["| °C | C/2 | 1 C | 2 C | 4 C | 6 C |", "|---" * 6 + "|"]
     for t, table in tables.items():
         found = pulse_resistance(table, setting.battery.cell_capacity(t))
         cells = [f"{1e3 * found[r]:.0f}" if r in found else "–" for r in (0.5, 1.0, 2.0, 4.0, 6.0)]
