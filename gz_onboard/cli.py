@@ -24,7 +24,10 @@ COMMANDS = {
     "mqtt": ("gz_onboard.display.mqtt", "publish the daemon's range on an MQTT broker, for Home Assistant"),
     "foxglove": ("gz_onboard.display.foxglove", "show the daemon's range live in Foxglove"),
     "replay": ("gz_onboard.recording.replay", "send a recorded log onto a bus, in its own timing"),
-    "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
+    "estimate": (
+        "gz_onboard.estimation.command",
+        "estimate the range on recorded rides, without a bus, as fast as possible",
+    ),
     "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
     "validate": (
         "gz_onboard.lab.validate",

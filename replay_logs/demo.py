@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO, cast
 
 from cantools.database.can import Message
+from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
 
 from gz_onboard import cli, state
 from gz_onboard.can.channel import CanChannel
 from gz_onboard.display.view import View
 from gz_onboard.events import Frame
-from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.recording.logs import read_frames, read_log
 from gz_onboard.reports.style import BLUE, INK, ORANGE, legend, new_figure, ordinate, rule, save

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard import cli
-from tests.lab.short_logs import short_log
+from tests.short_logs import short_log
 
 EMPTY = "is empty, a file of 0 bytes; copy or record it again"
 MISSING = "cannot be read: No such file or directory (did you mean 'ride.blf'?)"

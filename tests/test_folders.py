@@ -11,8 +11,8 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
-from tests.lab.short_logs import short_log
 from tests.recording.test_replay import Listener
+from tests.short_logs import short_log
 from tests.support import LOGS
 
 RIDE = str(LOGS / "coastdown.blf")

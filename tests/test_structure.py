@@ -29,6 +29,7 @@ LAYERS = [
     ["reports"],
     ["offline"],
     ["simulation"],
+    ["estimation"],
     ["lab", "display"],
     ["calibration"],
     ["discovery"],
@@ -40,7 +41,18 @@ LAYERS = [
 ]
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 
-OFFLINE = ("recording", "offline", "reports", "simulation", "lab", "calibration", "discovery", "vehicle_check", "api")
+OFFLINE = (
+    "recording",
+    "offline",
+    "reports",
+    "simulation",
+    "lab",
+    "estimation",
+    "calibration",
+    "discovery",
+    "vehicle_check",
+    "api",
+)
 # Lower, and yet nothing that these need know.
 FORBIDDEN = {
     ("estimator", "can"): "events are all that the estimator sees of a bus",

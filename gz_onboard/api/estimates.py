@@ -12,13 +12,11 @@ import numpy as np
 from gz_onboard import state as saved_state
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehicle_of
 from gz_onboard.errors import brief, not_an_input, writing
-from gz_onboard.lab import estimate_table, export_tables
-from gz_onboard.lab.estimate import summary_text
-from gz_onboard.lab.estimate_order import span_of, state_at
-from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through
-from gz_onboard.lab.estimate_state import held, text_of
-from gz_onboard.lab.estimate_summary import RideSummary, summary_of
-from gz_onboard.lab.kept_rows import KeptRows
+from gz_onboard.estimation import summary
+from gz_onboard.estimation.ride import MemoryLog, RideOptions, RideRun, open_estimate, run_ride, state_for
+from gz_onboard.estimation.saved_state import held, text_of
+from gz_onboard.estimation.summary import RideSummary, summary_of, summary_text
+from gz_onboard.lab import export_tables
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.signal_table import SignalTable
@@ -77,27 +75,28 @@ def estimate(
     numbers of frames. Raises InputError.
     """
     road = None if route is None else read_route(Path(route))
-    how, log = How(filter_name, route=road), KeptRows()
+    how, log = RideOptions(filter_name, route=road), MemoryLog()
     given, known = source_of(source), vehicle_of(vehicle)
     if state is None:
-        ridden = ride_through(open_estimate(given, known), how, log, progress)
+        ridden = run_ride(open_estimate(given, known), how, log, progress)
     else:
         ridden = _going_on(given, known, Path(state), how, log, progress)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]
     columns = table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")})
-    estimates = LoggedEstimates(columns, times, log.of(ESTIMATE_TOPIC))
-    return EstimatedRide(summary_of(ridden), estimates, log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
+    estimates = LoggedEstimates(columns, times, log.values(ESTIMATE_TOPIC))
+    return EstimatedRide(summary_of(ridden), estimates, log.values(WHY_TOPIC), log.values(CHANGE_TOPIC))
 
 
 def _going_on(
-    source: Path | SignalTable, vehicle: Vehicle, file: Path, how: How, log: Log, progress: Progress | None
-) -> Ridden:
+    source: Path | SignalTable, vehicle: Vehicle, file: Path, how: RideOptions, log: Log, progress: Progress | None
+) -> RideRun:
     """The ride, resumed from the saved state `file`, which is saved after it."""
     not_an_input(saved_state.copies(file), [source] if isinstance(source, Path) else [])
     with held(file):
-        at = state_at(file, source, span_of(source, vehicle))
-        ridden = ride_through(open_estimate(source, vehicle), replace(how, state=at), log, progress)
-        if ridden.went_on and (text := text_of(ridden.pipeline)):
+        at = state_for(file, source, vehicle)
+        at.check_date(source if isinstance(source, Path) else source.name)
+        ridden = run_ride(open_estimate(source, vehicle), replace(how, state=at), log, progress)
+        if text := text_of(ridden.pipeline):
             with writing(file):
                 saved_state.write(file, text)
     return ridden
@@ -106,7 +105,7 @@ def _going_on(
 @checked
 def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
     """The summaries of rides, a row each, with the columns that ``gz-onboard estimate --table`` writes."""
-    table = estimate_table.summary_table([ride.summary for ride in rides])
+    table = summary.summary_table([ride.summary for ride in rides])
     return {name: array_of(column) for name, column in table.items()}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.errors import InputError, not_an_input, writing
-from gz_onboard.lab.estimate import summary_text
+from gz_onboard.estimation.summary import summary_text
 from gz_onboard.lab.report import ReportedRide, check_page, page_of, report_of, section_of
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.digest import distinct_logs

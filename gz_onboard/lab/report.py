@@ -13,13 +13,11 @@ import numpy as np
 
 from gz_onboard.constants import WH
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
+from gz_onboard.estimation.ride import MemoryLog, RideOptions, known_vehicle, open_estimate, run_ride, vehicle_of
+from gz_onboard.estimation.summary import RideSummary, Why, missing_energy, summary_of, summary_rows
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.estimator.signals import FIX_2D
 from gz_onboard.events import TOLD, cause_words, words
-from gz_onboard.lab.estimate import expected_frames, lacks_energy, summary_rows
-from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through, vehicle_of
-from gz_onboard.lab.estimate_summary import RideSummary, Why, summary_of
-from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.arrays import held_at
 from gz_onboard.offline.digest import distinct_logs
@@ -121,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = arguments.vehicle, arguments.payload, False
     more = {"route": arguments.route, "located": not arguments.no_path}
     tasks = [ReportTask(log, Path(f"ride-{i}"), *given, **more) for i, log in enumerate(logs, 1)]
-    with progress_bar(lambda: expected_frames(logs), "frames", quiet=arguments.quiet) as display:
+    with progress_bar(lambda: len(logs), "rides", quiet=arguments.quiet) as display:
         results = over_rides(_section_of_log, tasks, arguments.jobs, display.update)
         found, failed = collect("report", results, display, None, lambda ride: ride.damage)
     if found:
@@ -141,7 +139,10 @@ def check_page(out: Path) -> None:
 
 def _section_of_log(task: ReportTask, progress: Progress | None = None) -> RideSection:
     """The section of the page for one log. Raises InputError."""
-    return section_of(report_of(task.path, vehicle_of(task), task.route, task.located, progress), task.stem.name)
+    made = section_of(report_of(task.path, vehicle_of(task), task.route, task.located), task.stem.name)
+    if progress:
+        progress(1)
+    return made
 
 
 # --- the ride -----------------------------------------------------------------------------------------------------
@@ -156,13 +157,13 @@ def report_of(
 ) -> ReportedRide:
     """Estimate a ride as the daemon would, with its ledger, path and temperatures. Raises InputError."""
     road = read_route(route) if route else None
-    log = KeptRows()
-    ridden = ride_through(open_estimate(source, vehicle), How(route=road, ledger=True), log, progress)
+    log = MemoryLog()
+    ridden = run_ride(open_estimate(source, vehicle), RideOptions(route=road, ledger=True), log, progress)
     samples = read_samples(source, vehicle)
     return ReportedRide(
         samples.name,
         summary_of(ridden),
-        [dict(row) for row in log.of(ESTIMATE_TOPIC)],
+        [dict(row) for row in log.values(ESTIMATE_TOPIC)],
         ridden.pipeline.estimator.forecaster.load.ledger or Ledger(),
         path_of(samples) if located else [],
         {role: _series(samples, role) for role in TEMPERATURE_COLOURS if role in samples.columns},
@@ -243,7 +244,7 @@ def _soc(s: RideSummary) -> str:
 def _tiles(ride: ReportedRide) -> str:
     s = ride.summary
     band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
-    missing = lacks_energy(s)
+    missing = missing_energy(s)
     over = f"over {s.energy_distance_km:.2f} km: {missing}" if missing else "over the ride"
     return tiles(
         [

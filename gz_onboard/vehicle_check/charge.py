@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import HOUR
-from gz_onboard.lab.estimate_summary import SHOWN_SD, gains
+from gz_onboard.estimation.summary import GAUGE_SD, gains
 from gz_onboard.offline.series import soc_at_load
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.electric import BY_VOLTAGE, SAGS, PackRide
@@ -91,7 +91,7 @@ def _by_voltage(of: PackRide, point: RestPoint) -> tuple[str, float, float]:
     sd = hypot(battery.ocv_sd, lost) / max(battery.ocv(soc, of.temperature)[1], FLATTEST)
     expected = battery.window.shown(soc, 0.0)[0]
     text = f"{point.shown:.0%} by the gauge, {expected:.0%} ± {min(sd, 1.0):.0%} by the voltage of {cell:.3f} V a cell"
-    return text, abs(point.shown - expected) / hypot(sd, SHOWN_SD), sd
+    return text, abs(point.shown - expected) / hypot(sd, GAUGE_SD), sd
 
 
 def _resistance_seen(of: PackRide, current: Array) -> float:
@@ -112,7 +112,7 @@ def _cells_that_fit(of: PackRide, start: RestPoint) -> int:
     drop = battery.circuit(soc, of.temperature)[0] * load
     series = (start.voltage + battery.series_resistance * amperes) / (rest - drop)
     lost = max(abs(drop), start.left / battery.cells_series)
-    doubt = series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + lost**2)
+    doubt = series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (GAUGE_SD * slope) ** 2 + lost**2)
     fit = round(series)
     clear = doubt < CELLS_SD and abs(series - fit) < CELLS_SD
     return fit if clear and 0 < abs(fit - battery.cells_series) <= MISCOUNTED else battery.cells_series

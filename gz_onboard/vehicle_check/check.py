@@ -16,9 +16,9 @@ from gz_onboard.can.codec import LONGEST_PAUSE_NS, RANGE, Codec
 from gz_onboard.can.layout import identifier_of
 from gz_onboard.can.mapping import UNITS, BusMapping, Source
 from gz_onboard.can.requests import NEGATIVE
+from gz_onboard.estimation.ride import PAUSE_S
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
-from gz_onboard.lab.estimate_tally import PAUSE
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.reports.results import clock, leap_text
@@ -102,7 +102,7 @@ def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
     start = min(float(times[0]) for times, _ in columns.values())
     end = max(float(times[-1]) for times, _ in columns.values())
     steps = np.diff(np.unique(np.concatenate([np.floor(times) for times, _ in columns.values()])))
-    return end - start - float(steps[steps > PAUSE].sum()), end
+    return end - start - float(steps[steps > PAUSE_S].sum()), end
 
 
 def _last_lengths(frames: FrameColumns) -> dict[int, int]:

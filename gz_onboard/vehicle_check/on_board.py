@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from math import sqrt
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
-from gz_onboard.lab.estimate_summary import UNFIT, summary_of
+from gz_onboard.estimation.ride import RideOptions, open_estimate, run_ride
+from gz_onboard.estimation.summary import POOR_FIT_V, summary_of
 from gz_onboard.reports.results import clock
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.electric import PackRide
@@ -24,19 +23,6 @@ SURE = 2.0  # sd
 BY_LOAD = {"accel_x", "gps_altitude"}  # the daemon holds them against the grade by the power that is needed
 
 
-class Mute:
-    """A log that keeps nothing."""
-
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """As of `log_rows.Log`."""
-
-    def frames(self, batch: Sequence[Any]) -> None:
-        """As of `log_rows.Log`."""
-
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
-        """As of `log_rows.Log`."""
-
-
 def on_board(log: Path, vehicle: Vehicle, load: bool = True, of: PackRide | None = None) -> Iterator[Finding]:
     """What the daemon's own checks would leave out for long; load: whether the power needed is the model's.
 
@@ -46,7 +32,7 @@ def on_board(log: Path, vehicle: Vehicle, load: bool = True, of: PackRide | None
         return
     try:
         ride = open_estimate(log, vehicle)
-        summary = summary_of(ride_through(ride, How(), Mute()))
+        summary = summary_of(run_ride(ride, RideOptions()))
     except InputError as error:  # no battery, range frames that do not fit: `run` says it
         yield unknown("on board", (), str(error))
         return
@@ -62,7 +48,7 @@ def on_board(log: Path, vehicle: Vehicle, load: bool = True, of: PackRide | None
         text = f"voltage less its prediction: {1e3 * summary.innovation_rms_v:.0f} mV RMS of a cell"
         if summary.innovation_rms_v < INNOVATION:
             yield right("on board", ("pack_voltage",), f"{text}; the battery's tables are about right")
-        elif summary.innovation_rms_v < UNFIT:
+        elif summary.innovation_rms_v < POOR_FIT_V:
             yield unknown("on board", ("pack_voltage",), f"{text}; wrong tables?")
         elif of and (why := _unsure(of, summary.innovation_rms_v)):
             yield unknown("on board", ("pack_voltage",), f"{text}: {why}, or the cells' number or capacity")

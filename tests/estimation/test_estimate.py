@@ -20,12 +20,8 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.can.dbc import find_dbc, load_database
+from gz_onboard.estimation.summary import KEYS, SUMMARY_VERSION
 from gz_onboard.events import EFF_FLAG, WINDOW, Estimate
-from gz_onboard.lab import estimate
-from gz_onboard.lab.estimate_log import EstimateTask
-from gz_onboard.lab.estimate_route import RouteSummary, off_text
-from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, gains
-from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
@@ -71,7 +67,7 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert (document["version"], document["failed"]) == (SUMMARY_VERSION, [])
     (ride,) = document["rides"]
-    assert set(ride) == set(estimate.KEYS)
+    assert set(ride) == set(KEYS)
 
     # The same quantities from the frames themselves, by cantools.
     database = load_database([find_dbc("vehicle.dbc")])
@@ -150,16 +146,6 @@ def test_a_capacity_that_the_vehicles_own_gauge_contradicts_is_told(tmp_path, ca
         assert ("\n  vehicle file " in out) is told
 
 
-def test_the_further_a_gauge_fell_the_less_other_charge_fits():
-    least, aged, most = zip(*(gains(fell) for fell in (0.06, 0.2, 0.5, 0.95, -0.95)), strict=True)
-    assert set(least) == {0.6}
-    assert aged == tuple(sorted(aged))
-    assert most == tuple(sorted(most, reverse=True))
-    assert (aged[0], most[0]) == (0.6, 1.7)
-    assert most[-1] < 1.2 < most[2]  # a sixth fewer cells than there are show over a whole discharge
-    assert aged[-1] == pytest.approx(1 - (most[-1] - 1))
-
-
 def test_a_summary_says_where_most_of_the_ride_was_not_on_its_route(tmp_path, capsys):
     route, found = LOGS / "city_34C.route.csv", tmp_path / "found.json"
     assert run(COASTDOWN, "--route", route, "--output", tmp_path, "--no-plot", "--json", found) == 0
@@ -167,7 +153,6 @@ def test_a_summary_says_where_most_of_the_ride_was_not_on_its_route(tmp_path, ca
     on, way = ride["route"]["ridden_km"], ride["distance_km"]
     assert 0.1 < on < way / 2
     assert f"\n{'':20}only {on:.2f} of the {way:.2f} km ridden were on the route\n" in capsys.readouterr().out
-    assert not off_text(RouteSummary(**ride["route"] | {"ridden_km": 0.6 * way}), way)
 
 
 def test_the_same_log_gives_the_same_bytes(tmp_path):
@@ -243,18 +228,6 @@ def test_a_broken_log_does_not_stop_the_others(tmp_path, frames, capsys, jobs):
     assert sorted(f.name for f in out.iterdir()) == ["good.estimate.mcap", "s.json", "zipped.estimate.mcap"]
     one, two = (estimates(out / f"{name}.estimate.mcap") for name in ("good", "zipped"))
     assert one == two
-
-
-def test_a_name_that_is_not_utf8_stops_nothing(tmp_path, frames, capsys):
-    folder = tmp_path / "logs"
-    folder.mkdir()
-    names = [os.fsdecode(b"r\xfcde.log"), "whole.log"]
-    for name in names:
-        candump(folder / name, frames[:2000])
-    assert run(folder, "--output", tmp_path, "--jobs", 1, "--json", tmp_path / "s.json") == 0
-    assert len(json.loads((tmp_path / "s.json").read_text())["rides"]) == 2
-    assert "r?de.log" in capsys.readouterr().out
-    assert read_metadata(tmp_path / os.fsdecode(b"r\xfcde.estimate.mcap"))["source"] == "r?de.log"
 
 
 def test_a_cut_log_is_estimated_as_far_as_it_goes(tmp_path, capsys):
@@ -345,14 +318,6 @@ def test_what_cannot_be_done_is_told(tmp_path, monkeypatch, capsys, frames, argu
     assert told in capsys.readouterr().err
 
 
-def test_a_slow_bus_is_estimated_at_every_window(vehicle, frames):
-    slow = frames[::12]  # 45 frames/s: a reader's batch takes 20 s
-    tally = Tally(0)
-    pipeline = Pipeline(vehicle, observer=tally)
-    feed(pipeline, FrameColumns.of(slow))
-    assert sum(tally.ticks.values()) == pytest.approx((slow[-1][0] - slow[0][0]) * 1e-9 / WINDOW, abs=2)
-
-
 def test_a_summary_names_the_sensors_that_were_left_out(tmp_path, capsys):
     rows = "".join(f"{t / 2},361,14,{36 + t % 4},{0 if t > 60 else 36}\n" for t in range(241))
     (tmp_path / "ride.csv").write_text(
@@ -412,24 +377,6 @@ def test_no_jump_of_the_clock_stops_it(jumps):
 
 HEAD = list(chain.from_iterable(read_frames(COASTDOWN)))[:1500]
 REFERENCE = read_vehicle("reference")
-
-
-def test_progress_is_told_from_all_processes(tmp_path, frames, monkeypatch):
-    logs = [candump(tmp_path / f"{n}.log", frames[:3000]) for n in range(3)]
-    tasks = [EstimateTask(log, tmp_path / log.stem, "reference", plot=False) for log in logs]
-    for jobs in 1, 2:
-        told: list[float] = []
-        results = list(estimate._results(tasks, jobs, told.append))
-        assert all(isinstance(result, RideSummary) for _, result in results)
-        assert sum(told) <= 9000
-        assert sum(told) >= 3000
-
-
-def test_the_expected_number_of_frames_is_about_right(tmp_path, frames):
-    assert estimate._expected(COASTDOWN) == len(frames)
-    assert estimate._expected(candump(tmp_path / "a.log", frames)) == pytest.approx(len(frames), rel=0.1)
-    assert estimate._expected(candump(tmp_path / "a.log.gz", frames[:9])) is None
-    assert estimate._expected(tmp_path / "none.blf") is None
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from gz_onboard.cli import main
-from gz_onboard.lab import estimate_log
+from gz_onboard.estimation import command
 from gz_onboard.vehicle import find_vehicle
-from tests.lab.short_logs import ENOUGH, short_log
+from tests.short_logs import ENOUGH, short_log
 from tests.support import HEARS_CTRL_C
 
 
@@ -61,7 +61,7 @@ def grown(log: Path, _: pytest.MonkeyPatch) -> None:
 
 
 def newer(_: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate_log, "__version__", "999")
+    monkeypatch.setattr(command, "__version__", "999")
 
 
 def same(_: Path, __: pytest.MonkeyPatch) -> None:

@@ -24,14 +24,13 @@ from gz_onboard.can.recorder import is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon import loop
 from gz_onboard.daemon.loop import Daemon
+from gz_onboard.estimation.ride import open_estimate, state_for
 from gz_onboard.events import Frame
-from gz_onboard.lab.estimate_order import span_of
-from gz_onboard.lab.estimate_ride import open_estimate
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import find_vehicle, read_vehicle
-from tests.lab.short_logs import short_log
-from tests.support import S, identifier, recorded, reference, with_cell_voltages, write_log
+from tests.short_logs import short_log
+from tests.support import S, identifier, recorded, reference, write_log
 
 DAY = 86_400 * S
 CUTS = {"a": (0.0, 60.0), "b": (70.0, 130.0), "c": (170.0, 220.0)}  # s of a ride, each a ride of its own
@@ -196,15 +195,6 @@ def test_a_table_of_signals_goes_on_too(tmp_path):
         gz.estimate(table(0.0), state=tmp_path / "other.json")
 
 
-def test_what_a_table_has_no_column_for_stays_learned(tmp_path):
-    vehicle, file = with_cell_voltages(tmp_path), tmp_path / "s.json"
-    gz.estimate(short_log(tmp_path / "ride.blf"), vehicle, state=file)
-    before = snapshot(file)["learned"]["weakest"]
-    found = gz.estimate(table(1.76e9), vehicle, state=file).summary
-    assert found.saved_state == "resumed"
-    assert snapshot(file)["learned"]["weakest"] == before
-
-
 def test_what_was_restored_is_as_old_as_the_first_voltage_finds_it(kept, cuts, tmp_path, monkeypatch):
     """A ride five seconds after the last, whose pack and inverter wake twenty seconds after the others."""
     begin = cuts["b"][-1][0] + 5 * S
@@ -244,7 +234,7 @@ def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
     frames = cuts["c"]
     begin, half = frames[0][0], frames[len(frames) // 2][0]
     write_log(tmp_path / "set.mcap", [(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames])
-    span = span_of(tmp_path / "set.mcap", reference())
+    span = state_for(tmp_path / "s.json", tmp_path / "set.mcap", reference())
     assert span.end_ns == frames[-1][0]
     assert span.begin_ns == pytest.approx(begin, abs=0.1 * S)
 
@@ -376,7 +366,7 @@ def test_a_run_that_was_interrupted_goes_on(kept, rides, tmp_path, capsys):
     (out / "s.json").write_bytes(before)  # of the last ride the log was written, the state was not
     assert resumed(out, rides) == [True, True, False]
     assert (out / "s.json").read_bytes() == after
-    (out / "s.json").write_bytes(state.encode({**snapshot(out / "s.json"), "cell_temperature": 20.0}, 2e9))
+    (out / "b.estimate.mcap").unlink()
     capsys.readouterr()
     assert "before the state" in refused(out, capsys, rides, options=["--resume"])
 
@@ -397,9 +387,3 @@ def test_a_month_later_only_the_new_ride_is_estimated(kept, rides, cuts, tmp_pat
     assert [ride["cpu_s"] == 0 for ride in said["rides"]] == [True, True, False]
     assert [Path(failure["file"]).name for failure in said["failed"]] == ["other.blf", "bad.blf"]
     assert (tmp_path / "s.json").read_bytes() == (kept / "s.json").read_bytes()
-
-
-def test_where_no_log_can_be_read_nothing_is_said_to_be_learned(tmp_path, capsys):
-    assert estimate(tmp_path, tmp_path / "none.blf") == 2
-    assert "what was learned" not in capsys.readouterr().out
-    assert not (tmp_path / "s.json").exists()

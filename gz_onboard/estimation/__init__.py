@@ -1,0 +1,1 @@
+"""The command `estimate`: recorded rides through the pipeline of the daemon."""
