@@ -16,6 +16,7 @@ EXTRAS = {
     "paho": ("paho-mqtt", "mqtt"),
     "pyarrow": ("pyarrow", "lab"),
     "scipy": ("scipy", "lab"),
+    "tomlkit": ("tomlkit", "lab"),
 }  # by module: the package that has it, and the extra of ours that installs it
 
 

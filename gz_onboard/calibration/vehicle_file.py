@@ -1,52 +1,58 @@
-"""Writes what calibration found into a vehicle file: what was not found stays as the base file has it, comments too."""
+"""Write calibrated values into a vehicle file; everything else in it stays, comments too."""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
+from tomlkit import TOMLDocument
+from tomlkit.items import Array as TomlArray
+from tomlkit.items import InlineTable, Item, Table
 
 from gz_onboard.arrays import Array
-from gz_onboard.calibration import toml_text
 from gz_onboard.calibration.fit import correlation
 from gz_onboard.calibration.result import Curve, Found, Result
-from gz_onboard.calibration.toml_text import KeyPath, number, spliced, string, with_keys
 from gz_onboard.errors import InputError, not_an_input
 from gz_onboard.model.effect import BASE_EFFECTS, PACKAGE_EFFECTS, Effect
 from gz_onboard.model.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
+Keys = Mapping[tuple[str, ...], object]  # new values by their path in the file; a dict becomes a table
 _MADE_BY = re.compile("^# Made by: .*\n", re.MULTILINE)
 
 
 def vehicle_output(out: Path, inputs: Sequence[Path], option: str = "") -> None:
-    """InputError if a vehicle file is not to be written as `out`. option: what stands before its name."""
+    """InputError if `out` cannot be written: not a .toml, or one of `inputs`. option: precedes it in the message."""
     if out.suffix != ".toml":
         raise InputError(f"{option}{out}: a vehicle file is a .toml")
     not_an_input([out], inputs)
 
 
-def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> Vehicle:
-    """Write the vehicle file `base` with what `results` found to `out`, as `write_whole`. InputError, OSError."""
-    text = merged(base.read_text(encoding="utf-8"), results, base, out)
-    if base.resolve().parent != out.resolve().parent:
-        text = with_keys(text, copied_effects(read_vehicle(base).model.effects, out), out)
-    return write_whole(out, text, "gz-onboard calibrate")
+def write_vehicle(
+    base: Path, results: Sequence[Result], out: Path, maker: str = "gz-onboard calibrate", keys: Keys | None = None
+) -> Vehicle:
+    """Write the vehicle file `base`, updated with `results` and `keys`, to `out`; return the vehicle as read back.
 
-
-def write_whole(out: Path, text: str, maker: str) -> Vehicle:
-    """Write the vehicle file `out`, whole or not at all, its first line naming its `maker`, and give it as read back.
-
-    Raises OSError, and InputError for a text that is no vehicle file: then what stood at `out` stays.
+    The file is written whole or not at all; its first line names the `maker`. Without `keys`, effect files that the
+    user wrote are copied if `out` is in another folder. Raises OSError, and InputError for values that no vehicle
+    file can hold.
     """
+    text = merged(base.read_text(encoding="utf-8"), results, base, out)
+    if keys is None and base.resolve().parent != out.resolve().parent:
+        keys = copied_effects(read_vehicle(base).model.effects, out)
+    if keys:
+        document = tomlkit.parse(text)
+        _set_all(document, keys)
+        text = tomlkit.dumps(document)
     if not text.startswith(head := f"# Made by: {maker}"):
         text = f"{head}\n{_MADE_BY.sub('', text)}"
     temporary = out.with_name(out.name + ".new")
@@ -54,9 +60,8 @@ def write_whole(out: Path, text: str, maker: str) -> Vehicle:
     try:
         vehicle = read_vehicle(temporary)
     except InputError as error:
-        raise InputError(
-            f"{str(error).replace(str(temporary), str(out))}; that was found, so the file is not written"
-        ) from error
+        message = str(error).replace(str(temporary), str(out))
+        raise InputError(f"{message}; this value was found, so the file is not written") from error
     else:
         temporary.replace(out)
     finally:
@@ -65,49 +70,36 @@ def write_whole(out: Path, text: str, maker: str) -> Vehicle:
 
 
 def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
-    """The text of a vehicle file `text` (of the file `base`) with what `results` found, to stand at `out`.
+    """Return the `text` of the vehicle file `base` with `results` in it, to be written to `out`.
 
-    A later result overrides an earlier one. Values are written with 6 significant digits. Paths to DBC files beside
-    `base` are written as seen from `out`. Raises InputError for what the file could not hold.
+    A later result overrides an earlier one. Numbers have 6 significant digits. Paths to DBC files next to `base` are
+    rewritten as seen from `out`. Raises InputError for values that the file cannot hold.
     """
-    document = tomllib.loads(text)
+    document = tomlkit.parse(text)
     parameters = {name: found for result in results for name, found in result.parameters.items()}
     curves = {name: curve for result in results for name, curve in result.curves.items()}
     _check(parameters, curves, base)
     order = list(declared_parameters())
-    parameters = dict(sorted(parameters.items(), key=lambda p: order.index(p[0]) if p[0] in order else len(order)))
-    groups = _correlations(document, results, set(parameters), base)
-    new: dict[KeyPath, str] = {
-        **{("parameters", name): f"{name} = {_parameter(found)}\n" for name, found in parameters.items()},
-        **_moved(document, base, out),
-        **_effects(document, results),
+    groups = _correlations(document.get("correlation", {}), results, set(parameters), base)
+    for name in [name for name in document.get("correlation", {}) if name not in groups]:
+        del document["correlation"][name]
+    if "battery.ocv" in curves and "battery" in document:
+        document["battery"].pop("rest_shift", None)  # it belongs to the previous curve
+    new: dict[tuple[str, ...], object] = {
+        ("parameters", name): _parameter(parameters[name])
+        for name in sorted(parameters, key=lambda name: order.index(name) if name in order else len(order))
     }
-    tables: dict[KeyPath, str] = {
-        **{tuple(name.split(".")): _curve(name, curve) for name, curve in curves.items()},
-        **{("correlation", name): group for name, group in groups.items()},
-    }
-    dropped: set[KeyPath] = {("correlation", name) for name in document.get("correlation", {})}
-    if "battery.ocv" in curves:
-        dropped.add(("battery", "rest_shift"))  # which is that of the curve before
-    return spliced(text, new, tables, dropped, base)
+    new |= _dbc_paths(document, base, out) | _effects(document, results)
+    new |= {tuple(name.split(".")): _curve(curve) for name, curve in curves.items()}
+    new |= {("correlation", name): group for name, group in groups.items()}
+    _set_all(document, new)
+    return tomlkit.dumps(document).rstrip("\n") + "\n"
 
 
-def _effects(document: Mapping[str, Any], results: Sequence[Result]) -> dict[KeyPath, str]:
-    """The model's effects with those that the data show and without those that they do not; nothing if they stay."""
-    listed = list(document.get("model", {}).get("effects", BASE_EFFECTS))
-    looked_for = {name: seen for result in results for name, seen in result.effects.items()}
-    new = [name for name in listed if looked_for.get(name, True)]
-    new += [name for name, seen in looked_for.items() if seen and name not in new]
-    if new == listed:
-        return {}
-    lines = "".join(f"    {string(name)},\n" for name in new)
-    return {("model", "effects"): f"effects = [\n{lines}]\n"}
+def copied_effects(effects: Iterable[Effect], out: Path) -> dict[tuple[str, ...], object]:
+    """Copy the user's own effect files into a folder next to the vehicle file `out`; return the key that names it.
 
-
-def copied_effects(effects: Iterable[Effect], out: Path) -> dict[KeyPath, str]:
-    """Copy the files of those `effects` that are not the package's into a folder beside the vehicle file `out`.
-
-    Gives the key for `with_keys` that names the folder; nothing if all are the package's.
+    Returns nothing if all `effects` belong to the package.
     """
     own = [file for file in (effect.file for effect in effects) if file.resolve().parent != PACKAGE_EFFECTS]
     if not own:
@@ -117,16 +109,113 @@ def copied_effects(effects: Iterable[Effect], out: Path) -> dict[KeyPath, str]:
     for file in own:
         if file.resolve().parent != folder.resolve():
             shutil.copyfile(file, folder / file.name)
-    return {("model", "effects_folder"): string(folder.name)}
+    return {("model", "effects_folder"): folder.name}
+
+
+# --- editing ------------------------------------------------------------------------------------------------------
+
+
+def _set_all(document: TOMLDocument, keys: Keys) -> None:
+    """Put `keys` into `document`, creating the tables on the way."""
+    for path, value in keys.items():
+        table: Any = document
+        for name in path[:-1]:
+            if name not in table:
+                table[name] = tomlkit.table(is_super_table=isinstance(value, dict) and not isinstance(value, Item))
+            table = table[name]
+        _set(table, path[-1], value)
+
+
+def _set(table: Any, key: str, value: object) -> None:
+    """Set `key` of `table`, in place if it is there, otherwise before the comments that end the table."""
+    old = table.get(key)
+    if isinstance(value, dict) and isinstance(old, dict) and not isinstance(old, InlineTable):
+        for name in [name for name in old if name not in value]:
+            del old[name]
+        for name, one in value.items():
+            _set(old, name, one)
+    elif old is not None:
+        table[key] = value
+    else:
+        body = table.value.body if isinstance(table, Table) else []
+        tail: list[Any] = []  # comments before the next table's header
+        while body and body[-1][0] is None:
+            tail.insert(0, body.pop())
+        if isinstance(value, dict) and not isinstance(value, Item):
+            new = tomlkit.table()
+            for name, one in value.items():
+                new.add(name, one)
+            table[key] = new.add(tomlkit.nl())
+        else:
+            table[key] = value
+        body.extend(tail)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}") + 0.0  # no negative zero
+
+
+def _row(values: Iterable[float]) -> list[float]:
+    return [_rounded(float(v)) for v in values]
+
+
+def _rows(matrix: Array) -> TomlArray:
+    """The array of `matrix`, one line for each row."""
+    array = tomlkit.array()
+    for row in matrix:
+        array.add_line(_row(row), indent="  ")
+    array.add_line(indent="")
+    return array
+
+
+# --- values -------------------------------------------------------------------------------------------------------
+
+
+def _parameter(found: Found) -> Item:
+    pairs = {"value": _rounded(found.value), "unit": found.unit, "sd": _rounded(found.sd), "status": "measured"}
+    pairs["source"] = found.source
+    return tomlkit.value(f"{{ {', '.join(f'{k} = {tomlkit.item(v).as_string()}' for k, v in pairs.items())} }}")
+
+
+def _curve(curve: Curve) -> dict[str, object]:
+    """The table of `curve`: axes, values, unit, median standard deviation, source."""
+    known = np.isfinite(curve.sd)
+    sd = {}
+    if known.any() and curve.unit in ("V", "V/K"):
+        sd["sd"] = _rounded(float(np.median(curve.sd[known])))
+    elif known.any():
+        sd["sd_relative"] = _rounded(float(np.median(curve.sd[known] / np.abs(curve.value[known]))))
+    source = curve.source if known.all() else f"{curve.source}; not measured but extrapolated: {_unmeasured(curve)}"
+    return {
+        **{axis: _row(values) for axis, values in curve.axes.items()},
+        "value": _row(curve.value) if curve.value.ndim == 1 else _rows(curve.value),
+        "unit": curve.unit,
+        **sd,
+        "status": "measured",
+        "source": source,
+    }
+
+
+def _unmeasured(curve: Curve) -> str:
+    """Say where `curve` has no data, such as "soc 0 to 0.1 at temperature -10"."""
+    (inner, nodes), *outer = curve.axes.items()
+    parts = []
+    for i, sd in enumerate(np.atleast_2d(curve.sd)):
+        known = zip(nodes.tolist(), np.isfinite(sd).tolist(), strict=True)
+        runs = [[node for node, _ in run] for there, run in groupby(known, itemgetter(1)) if not there]
+        spans = [f"{run[0]:g}" + (f" to {run[-1]:g}" if len(run) > 1 else "") for run in runs]
+        if spans:
+            parts.append(f"{inner} {', '.join(spans)}" + "".join(f" at {name} {at[i]:g}" for name, at in outer))
+    return "; ".join(parts)
 
 
 def _check(parameters: Mapping[str, Found], curves: Mapping[str, Curve], base: Path) -> None:
-    """InputError if the file could not be read again, naming what was found."""
+    """InputError, naming the data, for values that the reader of vehicle files would refuse."""
     declared = declared_parameters()
     for name, found in parameters.items():
         if (known := declared.get(name)) is None:
             continue  # of a user's own effect; reading the file checks it
-        value = toml_text.rounded(found.value)
+        value = _rounded(found.value)
         if found.unit != known.unit:
             raise InputError(f"{base}: {name}: was found in {found.unit}, but is in {known.unit}")
         if not known.low <= value <= known.high:
@@ -142,72 +231,26 @@ def _check(parameters: Mapping[str, Found], curves: Mapping[str, Curve], base: P
             raise InputError(f"{base}: {name}: must be {shape} finite numbers, is {curve.value.shape}")
 
 
-# --- values -------------------------------------------------------------------------------------------------------
-
-
-def _parameter(found: Found) -> str:
-    return (
-        f"{{ value = {number(found.value)}, unit = {string(found.unit)}, sd = {number(found.sd)}, "
-        f'status = "measured", source = {string(found.source)} }}'
-    )
-
-
-def _curve(name: str, curve: Curve) -> str:
-    """The table of `curve`: axes, value, unit, sd (one number for all of it: the median) and source."""
-    lines = [f"[{name}]"]
-    lines += [f"{axis} = {toml_text.row(values)}" for axis, values in curve.axes.items()]
-    if curve.value.ndim == 1:
-        lines.append(f"value = {toml_text.row(curve.value)}")
-    else:
-        lines += ["value = [", *(f"  {toml_text.row(row)}," for row in curve.value), "]"]
-    lines.append(f"unit = {string(curve.unit)}")
-    known = np.isfinite(curve.sd)
-    if known.any() and curve.unit in ("V", "V/K"):
-        lines.append(f"sd = {number(float(np.median(curve.sd[known])))}")
-    elif known.any():
-        lines.append(f"sd_relative = {number(float(np.median(curve.sd[known] / np.abs(curve.value[known]))))}")
-    lines += ['status = "measured"', f"source = {string(curve.source)}"]
-    if not known.all():
-        lines.append(f"{toml_text.UNMEASURED} {_unmeasured(curve)}.")
-    return "\n".join(lines) + "\n"
-
-
-def _unmeasured(curve: Curve) -> str:
-    """In words, where a curve has no data."""
-    names = list(curve.axes)
-    inner = curve.axes[names[0]]
-    rows: list[tuple[str, Array]] = [("", curve.sd)]
-    if curve.sd.ndim == 2:
-        outer = curve.axes[names[1]]
-        rows = [(f" at {names[1]} {outer[i]:g}", curve.sd[i]) for i in range(len(outer))]
-    parts = []
-    for where, sd in rows:
-        missing = ~np.isfinite(sd)
-        if missing.all():
-            parts.append(f"all{where}")
-        elif missing.any():
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
-            spans = [
-                f"{inner[a]:g}" if b - a == 1 else f"{inner[a]:g} to {inner[b - 1]:g}"
-                for a, b in list(pairwise(edges))[::2]
-            ]
-            parts.append(f"{names[0]} {', '.join(spans)}{where}")
-    return "; ".join(parts)
-
-
-# --- correlations -------------------------------------------------------------------------------------------------
+def _effects(document: TOMLDocument, results: Sequence[Result]) -> dict[tuple[str, ...], object]:
+    """The model's effects, with those that the data show and without those that they do not; nothing if unchanged."""
+    listed = list(document.get("model", {}).get("effects", BASE_EFFECTS))
+    looked_for = {name: seen for result in results for name, seen in result.effects.items()}
+    new = [name for name in listed if looked_for.get(name, True)]
+    new += [name for name, seen in looked_for.items() if seen and name not in new]
+    return {("model", "effects"): tomlkit.item(new).multiline(True)} if new != listed else {}
 
 
 def _correlations(
-    document: Mapping[str, Any], results: Sequence[Result], found: set[str], base: Path
-) -> dict[str, str]:
-    """The groups of correlated parameters, by name: those found, and what is left of the base file's."""
-    groups: dict[str, tuple[list[str], Array, str]] = {}
-    for name, group in document.get("correlation", {}).items():
+    old: Mapping[str, Any], results: Sequence[Result], found: set[str], base: Path
+) -> dict[str, dict[str, object]]:
+    """The groups of correlated parameters, by name: those in `results`, and those of `old` that still hold."""
+    groups: dict[str, dict[str, object]] = {}
+    for name, group in old.items():
         kept = [i for i, parameter in enumerate(group["parameters"]) if parameter not in found]
         if len(kept) > 1:
             matrix = np.array(group["value"], dtype=float)[np.ix_(kept, kept)]
-            groups[name] = ([group["parameters"][i] for i in kept], matrix, group.get("source", ""))
+            source = {"source": group["source"]} if "source" in group else {}
+            groups[name] = {"parameters": [group["parameters"][i] for i in kept], "value": _rows(matrix), **source}
     last = {name: i for i, result in enumerate(results) for name in result.parameters}
     for i, result in enumerate(results):
         for place, (names, covariance) in enumerate(result.covariance):
@@ -215,39 +258,18 @@ def _correlations(
                 if name not in last:
                     raise InputError(f"{base}: {result.procedure}: a covariance of {name}, which was not found")
             kept = [k for k, name in enumerate(names) if last[name] <= i]  # a later procedure knows better
-            if len(kept) < 2:
-                continue
-            key = result.procedure if place == 0 else f"{result.procedure}_{place + 1}"
-            matrix = correlation(np.asarray(covariance)[np.ix_(kept, kept)])
-            groups[key] = ([names[k] for k in kept], matrix, f"of {result.procedure}")
-    return {name: _group(name, *group) for name, group in groups.items()}
+            if len(kept) > 1:
+                groups[result.procedure if place == 0 else f"{result.procedure}_{place + 1}"] = {
+                    "parameters": [names[k] for k in kept],
+                    "value": _rows(correlation(np.asarray(covariance)[np.ix_(kept, kept)])),
+                    "source": f"of {result.procedure}",
+                }
+    return groups
 
 
-def _group(name: str, parameters: list[str], matrix: Array, source: str) -> str:
-    lines = [
-        f"[correlation.{toml_text.key(name)}]",
-        f"parameters = [{', '.join(map(string, parameters))}]",
-        "value = [",
-    ]
-    lines += [f"  {toml_text.row(row)}," for row in matrix]
-    lines += ["]", *([f"source = {string(source)}"] if source else [])]
-    return "\n".join(lines) + "\n"
-
-
-# --- paths --------------------------------------------------------------------------------------------------------
-
-
-def _moved(document: Mapping[str, Any], base: Path, out: Path) -> dict[KeyPath, str]:
-    """The keys that name files beside `base`, as seen from `out`."""
+def _dbc_paths(document: TOMLDocument, base: Path, out: Path) -> dict[tuple[str, ...], object]:
+    """The DBC files next to `base`, as seen from `out`."""
     here, there = base.resolve().parent, out.resolve().parent
-    if here == there:
-        return {}
-    moved: dict[KeyPath, str] = {}
-
-    def seen(name: str) -> str:
-        return Path(os.path.relpath(here / name, there)).as_posix() if (here / name).exists() else name
-
     names = document.get("dbc", [])
-    if isinstance(names, list) and all(isinstance(n, str) for n in names) and [seen(n) for n in names] != names:
-        moved["dbc",] = f"dbc = [{', '.join(string(seen(name)) for name in names)}]\n"
-    return moved
+    new = [Path(os.path.relpath(here / n, there)).as_posix() if (here / n).exists() else n for n in names]
+    return {("dbc",): new} if here != there and new != list(names) else {}

@@ -11,8 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from gz_onboard.calibration.result import Found, Result
-from gz_onboard.calibration.toml_text import KeyPath, string, with_keys
-from gz_onboard.calibration.vehicle_file import copied_effects, merged, write_whole
+from gz_onboard.calibration.vehicle_file import copied_effects, write_vehicle
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.discovery.channels import CHANNEL, ChannelNoise
 from gz_onboard.discovery.curves import with_inflation
@@ -290,16 +289,16 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
     assert isinstance(mixed, MixedModel)
     known = {name: value for name, value in vehicle.parameters.known.items() if "refitted on" in value.source}
     found = {name: Found(value.value, value.sd, value.unit, value.source) for name, value in known.items()}
-    text = merged(base.read_text(encoding="utf-8"), [Result("baseline", parameters=found)], base, out)
     keys = copied_effects(vehicle.model.effects, out) | saved_beside(mixed, out)
-    write_whole(out, with_keys(text, keys, out), f"gz-onboard discover --baseline, from {base.name}")
+    maker = f"gz-onboard discover --baseline, from {base.name}"
+    write_vehicle(base, [Result("baseline", parameters=found)], out, maker, keys)
 
 
-def saved_beside(mixed: MixedModel, out: Path) -> dict[KeyPath, str]:
+def saved_beside(mixed: MixedModel, out: Path) -> dict[tuple[str, ...], object]:
     """Write the statistics of healthy rides beside the vehicle file `out`, and give the keys of it that name them."""
     beside = out.with_suffix(".healthy.npz")
     save(mixed, beside)
-    return {("healthy", "file"): string(beside.name), ("healthy", "rides"): str(mixed.healthy)}
+    return {("healthy", "file"): beside.name, ("healthy", "rides"): int(mixed.healthy)}
 
 
 def accepted_into(mixed: MixedModel, found: Mapping[str, Found]) -> MixedModel:

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.calibration.result import Found, Result
-from gz_onboard.calibration.toml_text import number, string, with_keys
-from gz_onboard.calibration.vehicle_file import copied_effects, merged, write_whole
+from gz_onboard.calibration.vehicle_file import copied_effects, write_vehicle
 from gz_onboard.discovery.baseline import accepted_into, restore, saved_beside
 from gz_onboard.discovery.curves import CONSTANT
 from gz_onboard.discovery.judgement import Discovery, FoundCause, Unknown, energy_share, with_unit
@@ -78,22 +77,21 @@ def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discover
         return found, ["not written", *words]
     with writing(f"--write-model {out}"):
         keys = copied_effects(effects, out)
-        keys["model", "effects"] = "[" + ", ".join(map(string, names)) + "]"
+        keys["model", "effects"] = names
         if curve:
             folder.mkdir(exist_ok=True)
             (folder / f"{curve[0]}.py").write_text(curve[1], encoding="utf-8")
-            keys["model", "effects_folder"] = string(folder.name)
-        text = base.read_text(encoding="utf-8")
+            keys["model", "effects_folder"] = folder.name
         if not mixed.healthy and (lower := lowered_factor(found, causes, vehicle, curve is not None)):
             value, reason = lower
-            before = tomllib.loads(text).get("forecast", {}).get("source")
+            before = tomllib.loads(base.read_text(encoding="utf-8")).get("forecast", {}).get("source")
             source = f"{reason}; before: {before}" if before else reason
-            keys |= {("forecast", "factor"): number(value), ("forecast", "source"): string(source)}
+            keys |= {("forecast", "factor"): float(f"{value:.6g}"), ("forecast", "source"): source}
             words.append(f"forecast factor {vehicle.riding.factor:g} to {value:.3g}: it included what was found")
-        text = merged(text, [Result("discover", parameters=parameters)], base, out)
         if vehicle.healthy is not None:
             keys |= saved_beside(accepted_into(restore(vehicle), parameters), out)
-        write_whole(out, with_keys(text, keys, out), f"gz-onboard discover --write-model, from {base.name}")
+        maker = f"gz-onboard discover --write-model, from {base.name}"
+        write_vehicle(base, [Result("discover", parameters=parameters)], out, maker, keys)
     if report.ambiguous:
         words.append("of causes that cannot be told apart it has the likeliest, which other rides may refute")
     return replace(found, report=replace(report, extended_model=str(out))), [str(out), *words]
