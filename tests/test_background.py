@@ -19,24 +19,6 @@ def test_calls_are_made_in_their_order_and_elsewhere():
     assert made == [(number, "test") for number in range(100)]
 
 
-def test_no_more_waits_than_the_limit_and_what_weighs_nothing_always_may():
-    going = threading.Event()
-    background = Background("test", limit=10)
-    made: list[int] = []
-    assert background.call(going.wait, 30, weight=25)  # alone, one is taken however much it weighs
-    assert not background.call(made.append, 1, weight=1)
-    assert background.call(made.append, 2, weight=0)
-    assert background.load == 2.5
-    while not background.stuck:
-        assert not background.wait(0.01)
-    going.set()
-    assert background.wait(30)
-    assert background.load == background.stuck == 0.0
-    assert background.call(made.append, 3, weight=10)
-    assert background.close(30)
-    assert made == [2, 3]
-
-
 def test_what_a_call_raises_is_told_and_the_next_is_made(caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.ERROR)
     made: list[int] = []
@@ -55,7 +37,3 @@ def test_closing_does_not_wait_for_ever():
     assert not background.close(0.05)
     going.set()
     assert background.close(30)
-
-
-def test_never_used_it_closes_at_once():
-    assert Background("test").close(0.0)

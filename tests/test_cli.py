@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import io
 import os
 import re
 import signal
@@ -16,7 +15,6 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.cli import COMMANDS, command_line, main
-from gz_onboard.lab import report
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect
 
@@ -201,16 +199,6 @@ def test_log(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str, n
     assert name in refused(capsys, command, str(file), *options.get(command, []))
 
 
-def test_as_a_process():
-    """Nothing else than the message, as a person would see it."""
-    command = [sys.executable, "-m", "gz_onboard", "run", "--vehicle", "refrence"]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 2
-    assert run.stdout == ""
-    (line,) = run.stderr.splitlines()
-    assert line.startswith("gz-onboard run: refrence: ")
-
-
 def test_a_disk_that_is_full():
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "gz_onboard", "discover", "--list"]
@@ -232,23 +220,6 @@ def test_a_disk_that_fails_is_no_bad_input(
     assert status("export", RIDE, str(tmp_path / "x.log")) == 1
     assert f"x.log: cannot be written: {os.strerror(number)}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_terminal_without_the_signs_of_a_summary(monkeypatch: pytest.MonkeyPatch):
-    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    monkeypatch.setattr(sys, "stdout", out)
-    assert status("discover", "--list") == 0
-    assert b"?" in out.buffer.getvalue()  # for ±
-
-
-def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):
-    """What a command imports takes a second or two."""
-
-    def interrupted(_: argparse.ArgumentParser) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(report, "add_arguments", interrupted)
-    assert status("report", "a.mcap") == 130
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -281,32 +252,3 @@ def test_a_wrong_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFix
     said = capsys.readouterr().err
     assert said.startswith(f"usage: gz-onboard {command} [OPTION ...]")
     assert f"\ngz-onboard {command}: error: unrecognized arguments: --nonsense" in said
-
-
-@pytest.mark.parametrize(("words", "among"), [([], "estimate"), (["vehicle"], "check")])
-def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str], words: list[str], among: str):
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert f"\n    {among} " in said
-    assert "error: the following arguments are required" in said.splitlines()[-1]
-
-
-def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
-    assert status("--help") == 0
-    page = capsys.readouterr().out
-    assert all(re.search(rf"^    {name}\b", page, re.M) for name in COMMANDS)
-    for name in COMMANDS:
-        assert status(name, "--help") == 0
-        assert capsys.readouterr().out == HELP[f"gz-onboard {name}"]()
-    assert status("--version") == 0
-
-
-def test_a_folder_of_tables_says_how_to_give_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "ride.csv").write_text("time,speed\n0,5\n")
-    said = refused(capsys, "estimate", str(tmp_path))
-    assert "; its tables must be given one by one, such as ride.csv" in said
-    (tmp_path / "ride.csv").rename(tmp_path / "notes.md")  # a text that looks like a table is none
-    said = refused(capsys, "estimate", str(tmp_path))
-    assert said.endswith(": this folder holds no log (.mcap, .blf, .log, .asc, .csv, .trc, .mf4)\n")

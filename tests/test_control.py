@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import socket
 import stat
-import time
 from types import SimpleNamespace
 
 import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.daemon import control
-from gz_onboard.daemon.control import Control, ask, route_text
+from gz_onboard.daemon.control import Control, ask
 from gz_onboard.errors import InputError
 from gz_onboard.events import RouteState
 from gz_onboard.pipeline import Pipeline
@@ -93,36 +90,6 @@ def test_clients_that_stall_or_flood_are_left(listening, monkeypatch):
     assert ask(path, {"status": True})["ok"]
 
 
-def test_clients_are_answered_once_files_can_be_opened_again(listening, monkeypatch):
-    monkeypatch.setattr(control, "RETRY_S", 0.05)
-    _, path = listening
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with socket.socket(socket.AF_UNIX) as client:
-        client.settimeout(5)
-        os.close(lowest_free := os.dup(0))
-        resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
-        try:
-            client.connect(str(path))
-            time.sleep(0.2)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        client.sendall(b'{"status": true}\n')
-        assert b'"ok": true' in client.recv(65536)
-
-
-def test_a_socket_left_behind_is_taken_over_and_nothing_else(tmp_path, pipeline):
-    path = tmp_path / "control"
-    with socket.socket(socket.AF_UNIX) as old:
-        old.bind(str(path))
-    Control(path, lambda: pipeline).start()
-    assert ask(path, {"status": True})["ok"]
-    path.unlink()
-    path.write_text("mine")
-    with pytest.raises(InputError, match="cannot listen there: Address already in use"):
-        Control(path, lambda: pipeline).start()
-    assert path.read_text() == "mine"
-
-
 def test_the_command(listening, tmp_path, capsys):
     _, path = listening
     file = tmp_path / "way.route.csv"
@@ -139,20 +106,6 @@ def test_the_command(listening, tmp_path, capsys):
     file.write_text("distance_m\n0\n0\n")
     assert main(["route", str(file), "--socket", str(path)]) == 2
     assert "way.route.csv:3: distance_m: 0 m does not increase" in capsys.readouterr().err
-
-
-def test_the_answer_has_units():
-    on = {"ok": True, "route": "home", "state": "ON", "along_m": 3210.98, "left_m": 9764.1, "energy_j": 1098765.4}
-    on |= {"arrival_soc": 0.3249, "arrival_soc_p10": 0.2811, "arrival_soc_p90": 0.3702, "range_m": 24312.9}
-    assert route_text(on).splitlines() == [
-        "route  home",
-        "  on it, 3.2 km ridden, 9.8 km to its end for 305 Wh",
-        "  32 % of charge at its end (28 to 37 %, 80 % interval)",
-        "range  24.3 km",
-    ]
-    ends = {"battery_ends_after_m": 8123.4, "battery_ends_latitude": 48.1234567, "battery_ends_longitude": 11.5}
-    assert "  battery empty in 8.1 km, at 48.12346°, 11.50000°" in route_text(on | ends).splitlines()
-    assert route_text({"route": "home", "state": "OFF", "along_m": None}) == "route  home\n  not on it"
 
 
 def test_without_a_path_it_does_not_listen():

@@ -6,7 +6,6 @@ import copy
 import json
 import logging
 import os
-import re
 import resource
 import shutil
 import subprocess
@@ -14,8 +13,6 @@ import sys
 import threading
 import time
 import zlib
-from bisect import bisect_left
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count, pairwise
@@ -25,20 +22,16 @@ from typing import Any
 
 import can
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gz_onboard import state
 from gz_onboard.can._can import LibraryBus
 from gz_onboard.can.channel import CanChannel
-from gz_onboard.can.recorder import LogLimits, Recorder, is_complete
+from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.cli import main
-from gz_onboard.daemon.command import _lock, summary
-from gz_onboard.daemon.loop import Daemon, fair_share
+from gz_onboard.daemon.command import _lock
+from gz_onboard.daemon.loop import Daemon
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import EFF_FLAG, TRANSMITTED, WINDOW, Frame, Reason, State
-from gz_onboard.pipeline import TICK_NS
+from gz_onboard.events import TRANSMITTED, WINDOW, Frame, Reason, State
 from gz_onboard.recording.logs import read_frames, read_samples
 from tests.support import S, Scooter, check_frames, reference, ridden
 
@@ -123,61 +116,6 @@ def test_frames_in_frames_out(bus: str, tmp_path: Path):
     assert offline.range is not None
     assert told[-1] == pytest.approx(offline.range / 1000, rel=0.01)
     assert [f[1:3] for f in logged if f[3] & TRANSMITTED] == [f[1:3] for f in scene.heard]
-
-
-def test_the_summary_says_what_the_bus_was_told_last():
-    run = ridden(Scooter().steady(20.0))
-    estimate, end = run.estimates[-1], run.sent[-1][0]
-    assert estimate.range is not None
-    known = f"range {estimate.range / 1000:.1f} km, charge {100 * (estimate.soc or 0):.0f} %, "
-    _, told = summary(run.pipeline)
-    assert told.startswith(f"at the end {known}")
-    for second in range(1, 61):  # the bus has fallen silent: nothing is told any more
-        run.pipeline.advance((), end + second * S)
-    _, before, told = summary(run.pipeline)
-    assert re.match(rf"5\d\.\d s before the end {re.escape(known)}", before)
-    assert re.match("at the end invalid: .*NO_PACK_VOLTAGE", told)
-
-
-def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):
-    with Scene(bus) as scene:
-        time.sleep(1.5)
-    decoded = check_frames(scene.heard)
-    assert len(decoded["RANGE_Status"]) >= 5  # 15 on a machine with nothing else to do
-    assert {row["RANGE_EstimateState"] for row in decoded["RANGE_Estimate"]} == {State.STARTING}
-    assert all(row["RANGE_Remaining"] > 655.34 for row in decoded["RANGE_Estimate"])
-
-
-def test_identifiers_of_others_are_not_taken_in(bus: str):
-    channel = CanChannel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
-    channel.open()
-    with can.Bus(interface="virtual", channel=bus) as other:
-        for can_id, extended in ((0x200, False), (0x201, False), (0x200, True), (0x201, True), (0x7FF, False)):
-            other.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1"))
-    assert [frame[1] for frame in channel.drain()] == [0x200, EFF_FLAG | 0x201]
-    channel.close()
-
-
-def test_what_a_bus_gives_back_to_its_sender_is_nobody_elses(bus: str):
-    channel = CanChannel("virtual", bus, receive_own_messages=True)
-    channel.open()
-    daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
-    begin = time.time_ns()
-    sent: list[Frame] = []
-    with can.Bus(interface="virtual", channel=bus) as other:
-        for second in range(1, 4):
-            daemon.step(channel.drain(), begin + second * S)
-            while (message := other.recv(0)) is not None:
-                sent.append((0, message.arbitration_id, bytes(message.data), 0))
-        assert sent
-        daemon.step(channel.drain(), begin + 4 * S)
-        assert (daemon.pipeline.foreign, daemon.pipeline.codec.unknown) == ({}, {})
-        channel.drain()
-        last = next(frame for frame in reversed(sent) if frame[1] in daemon.pipeline.publisher.identifiers)
-        other.send(can.Message(arbitration_id=last[1], data=last[2], is_extended_id=False))
-        daemon.step(channel.drain(), begin + 5 * S)
-    assert sum(daemon.pipeline.foreign.values()) == 1  # from someone else, though it is alike
-    channel.close()
 
 
 @contextmanager
@@ -372,58 +310,6 @@ def test_a_damaged_state_is_refused_whole_and_the_one_before_is_used(
     assert found["soc"] == 0.41
 
 
-def test_whatever_restoring_raises_it_begins_afresh(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, monkeypatch: pytest.MonkeyPatch
-):
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode(learned, time.time()))
-
-    def half(self: Estimator, *_: object) -> None:
-        self.motion.gyro_bias = 7.0, 0.0
-        raise ZeroDivisionError("in the middle")
-
-    monkeypatch.setattr(Estimator, "restore", half)
-    daemon = Daemon(reference(), [], None, file)
-    assert daemon.restore() is None
-    assert "in the middle" in caplog.text
-    assert is_fresh(daemon)
-
-
-def test_where_the_latest_state_is_damaged_the_one_before_is_used(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot
-):
-    caplog.set_level(logging.INFO)
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
-    state.write(file, state.encode({**learned, "soc": 0.42}, time.time()))
-    latest, _ = state.copies(file)
-    file.with_suffix(".new").write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
-    data = bytearray(latest.read_bytes())
-    data[150] ^= 4
-    latest.write_bytes(data)
-    daemon = Daemon(reference(), [], None, file)
-    found = daemon.restore()
-    assert found is not None
-    assert found["soc"] == 0.41
-    assert caplog.text.count("not used, kept as") == 1
-    assert "continuing from the state saved" in caplog.text
-    assert [path.suffixes[-2:] for path in sorted(tmp_path.iterdir())] == [
-        [".json", ".refused"],
-        [".new"],
-        [".previous", ".json"],
-    ]
-
-
-def test_a_power_cut_between_two_renames_leaves_the_state_before(tmp_path: Path, learned: Snapshot):
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
-    latest, before = state.copies(file)
-    latest.replace(before)
-    found = Daemon(reference(), [], None, file).restore()
-    assert found is not None
-    assert found["soc"] == 0.41
-
-
 def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.INFO)
     (tmp_path / "file").write_text("in the way")
@@ -537,43 +423,6 @@ def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.Monke
     assert silent[0] in taken
 
 
-def test_held_up_while_it_reads_it_tells_the_same(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Frames that came after a tick do not count before it, however long the reading took: as of the log offline."""
-    recorder = Recorder(tmp_path, "v")
-    with Scene(bus, recorder=recorder) as scene:
-        (channel,) = scene.daemon.channels
-        drain, rounds = channel.drain, count(1)
-
-        def held_up() -> list[Frame]:
-            if next(rounds) % 5 == 0:
-                time.sleep(0.33)
-            return drain()
-
-        monkeypatch.setattr(channel, "drain", held_up)
-        sent = scene.ride(6.0)
-    (path,) = recorder.paths
-    logged = [frame for batch in read_frames(path) for frame in batch if not frame[3] & TRANSMITTED]
-    assert [frame[1:3] for frame in logged] == [frame[1:3] for frame in sent]
-    live = {values["time"]: values for name, _, values in read_samples(path) if name == "/estimate"}
-    offline = {float(f"{e.time:.7g}"): e for e in ridden(logged).estimates}
-    shared = sorted(set(live) & set(offline))
-    assert len(shared) >= 5
-    for at in shared:
-        for name in ("soc", "v1", "distance"):
-            was, ought = live[at][name], getattr(offline[at], name)
-            assert (was is None) == (ought is None), f"{name} at {at} s"
-            assert was is None or was == pytest.approx(ought, rel=1e-5), f"{name} at {at} s"
-
-
-def test_what_changes_is_said_once(bus: str, caplog: pytest.LogCaptureFixture):
-    caplog.set_level(logging.INFO)
-    with Scene(bus) as scene:
-        scene.ride(3.0)
-    said = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
-    assert said
-    assert all(a.split(";")[0] != b.split(";")[0] for a, b in pairwise(said)), said
-
-
 # --- more than it can take, and disks that do not answer ---------------------------------------------------------
 
 
@@ -628,41 +477,6 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
     assert daemon.pipeline.status()["overrun"] == daemon.pipeline.overrun
 
 
-@pytest.mark.parametrize("lag_s", [1.5, 10.0])
-def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float):
-    """As they come from a buffer that is read too slowly."""
-    channel = CanChannel("virtual", bus)
-    channel.open()
-    daemon = Daemon(reference(), [channel], None, None)
-    frames = Scooter().steady(10.0)
-    for lag_ns in (0, round(lag_s * S)):
-        at = 0
-        for now_ns in range(frames[0][0], frames[-1][0], TICK_NS):
-            end = bisect_left(frames, (now_ns,))
-            daemon.step(frames[at:end], now_ns + lag_ns)
-            at = end
-        last = daemon.pipeline.last
-        assert last is not None
-        assert (last.state is State.VALID) == (not lag_ns)
-        frames = [(frame[0] + 10 * S, *frame[1:]) for frame in frames]
-    daemon.close()
-
-
-@given(st.lists(st.integers(0, 6), max_size=300), st.integers(1, 200))
-@settings(deadline=None)
-def test_fair_shares(kinds: list[int], most: int):
-    frames: list[Frame] = [(i, kind % 5, b"", kind // 5) for i, kind in enumerate(kinds)]
-    kept = fair_share(frames, most)
-    assert kept == sorted(kept)
-    assert set(kept) <= set(frames)
-    came, stayed = Counter(kinds), Counter(channel * 5 + identifier for _, identifier, _, channel in kept)
-    assert set(stayed) == set(came)
-    assert len(kept) <= max(most, len(came))
-    assert len(frames) > most or kept == frames
-    for kind, n in stayed.items():  # the latest of each
-        assert [f for f in kept if f[3] * 5 + f[1] == kind] == [f for f in frames if f[3] * 5 + f[1] == kind][-n:]
-
-
 def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     answer = threading.Event()
     real = os.fdatasync, os.fsync
@@ -696,39 +510,6 @@ def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, mo
     assert last is not None
     assert found is not None
     assert found[0]["soc"] == pytest.approx(last.soc, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("current", "voltage", "settled", "least", "most"),
-    [(100.0, 46.0, 0, 15, 41), (1.0, 50.0, 200, 4, 6)],  # at first what polarises the cells is found out
-)
-def test_the_state_is_saved_when_the_charge_has_moved(
-    bus: str, tmp_path: Path, current: float, voltage: float, settled: int, least: int, most: int
-):
-    """Ridden hard, what a cut costs is a tenth of a point; else it is saved once in ten seconds."""
-    file = tmp_path / "scooter.json"
-    channel = CanChannel("virtual", bus)
-    channel.open()
-    daemon = Daemon(reference(), [channel], None, file)
-    keeper = daemon._keeper
-    assert keeper is not None
-    frames = Scooter().steady(40.0 + settled, current=current, voltage=voltage)
-    begun = frames[0][0] + settled * S
-    texts: list[bytes] = []
-    at = 0
-    for now_ns in range(frames[0][0], frames[-1][0], TICK_NS):
-        end = bisect_left(frames, (now_ns,))
-        daemon.step(frames[at:end], now_ns)
-        at = end
-        assert keeper._thread.wait(20)
-        last = daemon.pipeline.last
-        if last and last.soc is not None:
-            saved = file.read_bytes()
-            texts += [] if now_ns < begun or (texts and texts[-1] == saved) else [saved]
-            snapshot, _ = state.decode(saved, now_ns / S)
-            assert snapshot["soc"] == pytest.approx(last.soc, abs=0.0012)
-    daemon.close()
-    assert least <= len(texts) <= most
 
 
 # --- alone -------------------------------------------------------------------------------------------------------
@@ -812,56 +593,3 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
     assert last is not None
     assert found is not None
     assert found[0]["soc"] == last.soc
-
-
-def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
-    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    channel = CanChannel("virtual", bus)
-    channel.open()
-    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", limits=LogLimits(sync_s=1e6))
-    daemon = Daemon(reference(), [channel], recorder, file)
-    frames = Scooter().steady(3.0)
-    half = len(frames) // 2
-
-    def broken() -> int:
-        daemon.step(frames[: half + 1], frames[half][0])
-        daemon.step(frames[half + 1 :], frames[-1][0])  # so soon after the first it is not saved
-        raise RuntimeError("unforeseen")
-
-    monkeypatch.setattr(daemon, "tick", broken)
-    with pytest.raises(RuntimeError, match="unforeseen"):
-        daemon.run()
-    (path,) = recorder.paths
-    assert is_complete(path)
-    assert [f for batch in read_frames(path) for f in batch if not f[3] & TRANSMITTED] == frames
-    found = state.load(file, time.time())
-    assert found is not None
-    assert found[0] == json.loads(json.dumps(daemon.pipeline.estimator.snapshot(reference().key)))
-
-
-HANGING = """
-import os, sys, threading
-def hang(descriptor):
-    print("hangs", flush=True)
-    threading.Event().wait()
-from gz_onboard.daemon import loop
-from gz_onboard.cli import main
-os.fdatasync = hang
-loop.STOP_S = 0.5
-sys.exit(main(["run", "--interface", "virtual", "--channel", "x", "--log-dir", sys.argv[1]]))
-"""
-
-
-def test_it_ends_though_a_disk_does_not_answer(tmp_path: Path):
-    command = [sys.executable, "-c", HANGING, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "hangs\n"
-        process.terminate()
-        out, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert "received 0 frames" in out
-    assert "its end is lost" in errors
-    assert "Traceback" not in errors
-    assert "Fatal" not in errors

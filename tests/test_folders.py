@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.recording.logs import ESTIMATED, logs_among, read_frames
-from tests.recording.test_replay import Listener
+from gz_onboard.recording.logs import ESTIMATED
 from tests.short_logs import short_log
 from tests.support import LOGS
 
@@ -68,10 +66,6 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_no_command_is_forgotten() -> None:
-    assert set(cli.COMMANDS) == {*TAKING, *REFUSING}
-
-
 @pytest.mark.usefixtures("folders")
 @pytest.mark.parametrize("arguments", TAKING.values(), ids=TAKING)
 def test_a_folder_without_logs(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,38 +80,6 @@ def test_a_folder_without_logs(arguments: list[str], capsys: pytest.CaptureFixtu
 def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
     assert said in capsys.readouterr().err
-
-
-def test_folders_in_folders_are_logs_and_urls_are_none(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    deep = folders / EMPTY / "2026" / "may"
-    deep.mkdir(parents=True)
-    (folders / EMPTY / ".trash").mkdir()
-    short_log(folders / EMPTY / ".trash" / "old.blf", FRAMES)
-    short_log(deep / "c.blf", FRAMES)
-    assert logs_among([Path(EMPTY)]) == [Path(EMPTY, "2026", "may", "c.blf")]
-    for argument, told in ("s3://bucket/a.blf", "s3://bucket/a.blf: is a URL"), ("", "the name of a log is empty"):
-        assert cli.main(["estimate", argument]) == 2
-        assert told in capsys.readouterr().err
-
-
-@pytest.fixture
-def listener(request: pytest.FixtureRequest) -> Iterator[Listener]:
-    made = Listener(request.node.name)
-    yield made
-    made.close()
-
-
-def test_replay_sends_one_log_after_the_other(
-    folders: Path, listener: Listener, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bus = ["--interface", "virtual", "--channel", request.node.name, "--speed", "0", "--quiet"]
-    assert cli.main(["replay", str(folders / FULL), *bus]) == 0
-    logs = [folders / FULL / "a.blf", folders / FULL / "b.log"]
-    sent = [frame[1:3] for log in logs for batch in read_frames(log) for frame in batch]
-    assert [frame[1:3] for frame in listener.close()] == sent
-    told = capsys.readouterr().out
-    assert f"{len(sent)} frames in" in told
-    assert "rounds" not in told
 
 
 def test_export_makes_a_folder_for_each_log(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -91,11 +91,6 @@ def test_no_output_is_a_folder(folder: Path, capsys: pytest.CaptureFixture[str])
     assert {file.name for file in folder.iterdir()} == before
 
 
-def test_devices_are_no_files(folder: Path):
-    outputs = ["--json=/dev/null", "--markdown", "/dev/null"]
-    assert main(["validate", "ride.blf", "--no-plot", *outputs, "--output", "new", "--quiet"]) == 0
-
-
 def test_a_calibration_is_written_into_no_other_kind_of_file(folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main([*CALIBRATE, "--output", "new.csv.gz"]) == 2
     assert "--output new.csv.gz: a vehicle file is a .toml" in capsys.readouterr().err

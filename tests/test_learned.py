@@ -6,7 +6,6 @@ import fcntl
 import json
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,8 @@ from gz_onboard import state
 from gz_onboard.cli import main
 from gz_onboard.errors import BAD_INPUT, OK
 from gz_onboard.estimator.battery_filter import with_soc
-from gz_onboard.estimator.weakest import NAMES
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
-from tests.support import with_cell_voltages
 
 CAPACITY, RESISTANCE = 0.8, 1.5
 
@@ -60,37 +57,6 @@ def test_it_shows_what_was_learned(saved: Path, capsys: pytest.CaptureFixture[st
     assert text.startswith("per cent learned: share of the initial uncertainty")
 
 
-def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
-    vehicle = read_vehicle("reference")
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    estimator = Pipeline(vehicle).estimator
-    estimator.restore(snapshot, vehicle.key, 0.0)
-    learner = estimator.forecaster.learner
-    price = learner.state.habits.price._replace(level=1.2, level_variance=0.01**2)
-    learner.state = learner.state._replace(habits=learner.state.habits._replace(price=price))
-    estimator.forecaster.ridden_by("anna")
-    estimator.pack.state, estimator.pack.is_started = with_soc(estimator.pack.state, 0.6, 1e-4), True
-    changed = estimator.snapshot(vehicle.key)
-    assert changed
-    state.write(saved, state.encode(changed, time.time()))
-    assert main(["learned", "--state", str(saved), "--json"]) == OK
-    riders = json.loads(capsys.readouterr().out)["riders"]
-    assert list(riders) == ["anna", ""]
-    assert riders[""]["price"]["factor"] == pytest.approx(1.2 / vehicle.riding.factor)
-    assert riders[""]["price"]["percent_learned"] > 80
-    assert riders["anna"]["price"]["percent_learned"] < 30
-    assert main(["learned", "--state", str(saved)]) == OK
-    text = capsys.readouterr().out
-    unnamed = text.index("\nrides without a known rider:\n")
-    assert text.index("\nrider anna:\n") < unnamed
-    assert main(["learned", "--state", str(saved), "--reset", "riding"]) == OK
-    text = capsys.readouterr().out
-    assert text.startswith(f"reset in {saved}: riding\n")
-    assert "anna" not in text
-    assert "price           1.000 ± 0.1" in text
-    assert "nothing learned: energy per kilometre" in text
-
-
 def test_it_resets_the_battery_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFixture[str]):
     before, _ = state.load(saved, time.time()) or ({}, None)
     learned = shown(saved, capsys, "--reset", "battery")  # the JSON is nothing but JSON
@@ -100,27 +66,6 @@ def test_it_resets_the_battery_and_keeps_the_rest(saved: Path, capsys: pytest.Ca
     assert {**after, "learned": before["learned"]} == before
     assert age == pytest.approx(3600, abs=10)
     assert shown(saved, capsys, "--reset", "all")["resistance"]["factor"] == 1.0
-
-
-def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    vehicle = with_cell_voltages(tmp_path)
-    assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal
-    estimator = Pipeline(vehicle).estimator
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    estimator.restore(snapshot, vehicle.key, 0.0)
-    estimator.pack.state, estimator.pack.is_started = with_soc(estimator.pack.state, 0.6, 1e-4), True
-    estimator.pack.weakest.known = replace(estimator.pack.weakest.known, means=(0.04, 1 / 0.9 - 1, 0.0, 0.0))
-    changed = estimator.snapshot(vehicle.key)
-    assert changed
-    state.write(saved, state.encode(changed, time.time()))
-    options = "--vehicle", str(vehicle.file)
-    learned = shown(saved, capsys, *options)
-    assert learned["weak_charge"]["factor"] == pytest.approx(0.96)
-    assert learned["weak_capacity"]["factor"] == pytest.approx(0.9)
-    assert main(["learned", "--state", str(saved), *options, "--reset", "battery"]) == OK
-    assert "weak_capacity   1.000 ± 0.080  nothing learned: capacity of the weakest group" in capsys.readouterr().out
-    learned = shown(saved, capsys, *options)
-    assert learned["weak_charge"]["factor"] == 1.0
 
 
 def test_it_resets_nothing_under_a_daemon_that_runs(saved: Path, capsys: pytest.CaptureFixture[str]):

@@ -51,18 +51,6 @@ def test_a_status_never_becomes_another_field(text: str):
     assert message.splitlines() == [message]
 
 
-@pytest.mark.parametrize("address", [None, "", "/nowhere/notify", "@gz-onboard-gone", "vsock:2:1234"])
-def test_nobody_listens(monkeypatch: pytest.MonkeyPatch, address: str | None):
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    if address is not None:
-        monkeypatch.setenv("NOTIFY_SOCKET", address)
-    assert not notify(READY=1)
-
-
-def test_a_full_socket_does_not_block(listener: socket.socket):
-    assert any(not notify(WATCHDOG=1) for _ in range(10_000))
-
-
 @pytest.mark.parametrize(
     ("environ", "expected"),
     [

@@ -9,7 +9,6 @@ import pytest
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
 from gz_onboard.options import LOG_SUFFIXES, add_shared, number
-from gz_onboard.pipeline import filter_backend
 from gz_onboard.recording import logs
 
 
@@ -31,31 +30,8 @@ def test_a_number_beyond_its_range_is_refused_with_its_unit(text):
         number("--payload", 0.0, 300.0, "kg")(text)
 
 
-def test_what_is_no_number_is_left_to_argparse():
-    with pytest.raises(ValueError, match="heavy"):
-        number("--payload", 0.0, 300.0, "kg")("heavy")
-    assert number("--jobs", 1, 2, kind=int).__name__ == "int"
-
-
-@pytest.mark.parametrize("name", ["ride.blf", "a/ride.mcap.gz", "x.log"])
-def test_json_takes_no_name_of_a_log(parser, name):
-    with pytest.raises(InputError, match="name of a log"):
-        parser.parse_args(["--json", name])
-
-
-def test_json_without_a_name_is_standard_output(parser):
-    assert parser.parse_args([]).json is None
-    assert parser.parse_args(["--json"]).json == "-"
-    assert parser.parse_args(["--json", "table.csv"]).json == "table.csv"
-
-
 def test_the_formats_of_logs_are_those_that_can_be_read():
     assert set(LOG_SUFFIXES) == {name for name in logs._READERS if name.startswith(".")}
-
-
-def test_a_filter_that_there_is_not_is_refused():
-    with pytest.raises(InputError, match=r"filter 'scaler': must be scalar or filterpy \(did you mean 'scalar'"):
-        filter_backend("scaler")
 
 
 def test_an_option_has_one_meaning():

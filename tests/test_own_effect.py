@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import shlex
 import subprocess
@@ -13,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gz_onboard.cli import main
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Bound
@@ -82,31 +80,9 @@ def test_its_effects_keep_to_the_contract(folder: Path, name: str):
     assert values(rows[2]) > 0
 
 
-def test_it_goes_to_another_process(folder: Path):
-    effect = load_effect("top_box", folder / "effects")
-    script = "import pickle, sys; print(pickle.load(sys.stdin.buffer).parameters[0].name)"
-    run = subprocess.run([sys.executable, "-c", script], input=pickle.dumps(effect), capture_output=True, check=False)
-    assert run.stdout.decode().strip() == "top_box_drag_area", run.stderr
-
-
-def test_the_list_has_it(folder: Path, capsys):
-    assert main(["discover", "--list", "--effects", str(folder / "effects")]) == 0
-    listed = capsys.readouterr().out
-    assert "top_box_drag_area [m²], prior 0.04 ± 0.03" in listed
-    assert "More auxiliary current on rides below 12 degC" in listed
-
-
 def test_the_onboard_model_has_it(folder: Path):
     base, boxed = (read_vehicle(name) for name in ("reference", str(folder / "boxed.toml")))
     assert boxed.parameters["top_box_drag_area"] == 0.06
     assert boxed.key != base.key
     expected = [Forecaster(v.model, v.pack, v.riding).forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0) for v in (base, boxed)]
     assert expected[1].range < 0.99 * expected[0].range
-
-
-def test_the_folder_may_be_given_instead(folder: Path, tmp_path: Path):
-    """As the discovery does with its option."""
-    text = (folder / "boxed.toml").read_text(encoding="utf-8").replace('effects_folder = "effects"\n', "")
-    file = tmp_path / "boxed.toml"
-    file.write_text(text, encoding="utf-8")
-    assert "top_box" in read_vehicle(str(file), effects_folder=folder / "effects").key

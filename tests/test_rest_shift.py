@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,11 +14,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.events import Group
 from gz_onboard.model.battery import Battery
-from gz_onboard.model.drawable import drawable
 from gz_onboard.model.functions import PiecewiseLinear
-from gz_onboard.offline.series import ocv_over
 from gz_onboard.simulation.parts import FirstOrderPack
-from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.events import EventEstimator
@@ -35,13 +31,6 @@ unit = "V"
 sd = 0.004
 """
 temperatures = st.floats(-30, 50)
-
-
-@given(st.lists(st.tuples(st.floats(-0.05, 1.05), temperatures), min_size=1, max_size=20))
-def test_a_whole_ride_rests_where_each_step_does(points):
-    soc, celsius = np.array(points).T
-    for battery in (PLAIN, COLD):
-        assert ocv_over(battery, soc, celsius) == pytest.approx([battery.ocv(s, t)[0] for s, t in points], abs=1e-12)
 
 
 def read(folder: Path, table: str) -> Battery:
@@ -78,12 +67,6 @@ def test_bad_tables_are_refused(tmp_path, old, new, parts):
         assert part in str(error.value)
 
 
-@given(st.floats(-0.05, 1.05), temperatures)
-def test_soc_at_inverts_ocv(soc, temperature):
-    assert COLD.soc_at(COLD.ocv(soc, temperature)[0], temperature) == pytest.approx(soc, abs=1e-9)
-    assert COLD.ocv(soc, temperature)[0] - PLAIN.ocv(soc)[0] == pytest.approx(COLD.rest_shift(temperature), abs=1e-12)
-
-
 @given(st.floats(-0.05, 1.05), temperatures, st.floats(-500, 3000))
 def test_without_the_table_the_same_bits(soc, temperature, power):
     assert PLAIN.ocv(soc, temperature) == PLAIN.ocv(soc)
@@ -110,33 +93,6 @@ def test_the_filter_reckons_with_it():
     assert soc[False] < 0.6 - 0.5 * 0.02 / COLD.ocv(0.6)[1]
 
 
-def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
-    groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-    sd = {}
-    for battery in (COLD, PLAIN):
-        estimator = EventEstimator(groups, battery, VEHICLE.model, VEHICLE.riding)
-        estimator.handle((0.9, 0, (0.0,)))
-        for time in (1.0, 2.0):
-            estimator.handle((time, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
-        estimator.close()
-        assert estimator.pack.is_started
-        expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
-        assert estimator.pack.state.soc == pytest.approx(expected, abs=1e-3)
-        sd[battery is COLD] = estimator.pack.voltage_noise.rest
-    assert sd[True] > 1.01 * sd[False]
-
-
-def test_a_ride_s_rest_voltage_is_taken_as_cold():
-    signals = {
-        "pack_voltage": np.full(600, 14 * COLD.ocv(0.6, 0.0)[0]),
-        "cell_temperature": np.zeros(600),
-        "pack_current": np.zeros(600),
-    }
-    recorded = Recorded("cold", 0.1, signals, np.zeros(1), np.zeros(1))
-    assert rest_soc(recorded, replace(VEHICLE, battery=COLD)) == pytest.approx(0.6, abs=1e-6)
-    assert rest_soc(recorded, VEHICLE) == pytest.approx(PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0]), abs=1e-6)
-
-
 def test_the_simulated_pack_rests_there_and_its_energy_closes():
     pack = FirstOrderPack(COLD, 0.6)
     assert pack.draw(0.0, 0.01, 0.0)[1] == pytest.approx(14 * COLD.ocv(0.6, 0.0)[0], abs=1e-6)
@@ -148,32 +104,6 @@ def test_the_simulated_pack_rests_there_and_its_energy_closes():
     assert pack.chemical_energy_drawn() == pytest.approx(delivered + heat, rel=2e-5)
     standing = Scooter(replace(VEHICLE, battery=COLD), soc=0.6, ambient=0.0)
     assert standing.voltage == pytest.approx(14 * COLD.ocv(0.6, 0.0)[0])
-
-
-@given(st.floats(0.1, 1.0), st.floats(-10, 20), st.floats(100, 2000))
-def test_less_can_be_drawn_from_cells_that_rest_lower(soc, temperature, power):
-    less, more = (drawable(battery, soc, temperature, power).energy for battery in (COLD, PLAIN))
-    assert less <= more + 1e-6
-    if more > 1e5:
-        assert less < more
-
-
-ERRORS = """
-[battery.voltage_error]
-temperature = [-10.0, 25.0]
-value = [0.020, 0.006]
-unit = "V"
-"""
-
-
-def test_what_the_circuit_errs_by_is_read_over_temperature(tmp_path):
-    battery = read(tmp_path, ERRORS)
-    assert battery.voltage_error(-20.0, 0.01) == pytest.approx(0.020)
-    assert battery.voltage_error(7.5, 0.01) == pytest.approx(0.013)
-    without = replace(PLAIN, voltage_error_curve=None)
-    assert without.voltage_error(7.5, 0.01) == 0.01
-    with pytest.raises(InputError, match=r"voltage_error.*outside 0 to 0\.2"):
-        read(tmp_path, ERRORS.replace("0.020", "-0.020"))
 
 
 TIMES = """
@@ -199,19 +129,3 @@ def test_for_how_long_it_errs_the_same_way_is_read_over_temperature(tmp_path):
         read(tmp_path, TIMES.replace("160.0", "1.0"))
     with pytest.raises(InputError, match=r"voltage_error_time.*min"):
         read(tmp_path, TIMES.replace('"s"', '"min"'))
-
-
-def test_a_wrong_start_is_left_by_less_where_errors_stay_longer(tmp_path):
-    """Ten minutes of one voltage: less than a mean of independent errors where they stay for a quarter of an hour."""
-    sd = {}
-    for name, battery in (("long", read(tmp_path, TIMES)), ("usual", PLAIN)):
-        groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
-        estimator = EventEstimator(groups, battery, VEHICLE.model, VEHICLE.riding)
-        volts = 14 * battery.ocv(0.6, -10.0)[0]
-        for k in range(1, 600):
-            estimator.handle((k - 0.1, 0, (-10.0,)))
-            load = 20.0 if k % 20 < 10 else 2.0  # no rest
-            estimator.handle((float(k), 1, (volts - 0.05 * load, load)))
-        assert estimator.pack.is_started
-        sd[name] = estimator.pack.state.covariance[0] ** 0.5
-    assert sd["long"] > 1.02 * sd["usual"]

@@ -56,35 +56,6 @@ def test_age(tmp_path: Path, saved_at: float, age: float | None):
     assert state.load(file, NOW) == (SNAPSHOT, age)
 
 
-@pytest.mark.parametrize(
-    ("uptime", "clocks", "age"),
-    [
-        (1030.0, [], 30.0),  # the same boot: both clocks say so
-        (12.0, [], None),  # off for nobody knows how long: the wall clock went on from where it was
-        (5000.0, [], None),  # set meanwhile, or another boot
-        (12.0, [f"{NOW:.0f}\n"], 30.0),  # a clock of its own
-        (12.0, [f"{NOW - 35:.0f}\n"], 30.0),  # one that is a little slow
-        (12.0, ["12\n"], None),  # one without a battery began at 1970 when the power came back
-        (12.0, [f"{NOW - 3600:.0f}\n"], None),  # one whose battery failed meanwhile
-        (1030.0, ["1030\n"], 30.0),
-        (12.0, ["12\n", f"{NOW:.0f}\n"], 30.0),  # a board's own without a battery, and one that was added
-        (12.0, ["rubbish", ""], None),
-    ],
-)
-def test_age_on_a_board_with_or_without_a_clock_of_its_own(
-    tmp_path: Path, uptime: float, clocks: list[str], age: float | None
-):
-    for number, text in enumerate(clocks):
-        (tmp_path / f"rtc{number}").mkdir()
-        (tmp_path / f"rtc{number}" / "since_epoch").write_text(text)
-    saved = state.encode(SNAPSHOT, NOW - 30, 1000.0)
-    assert state.decode(saved, NOW, uptime, state.kept_time(tmp_path)) == (SNAPSHOT, age)
-
-
-def test_a_machine_without_the_directory_of_clocks_has_none(tmp_path: Path):
-    assert state.kept_time(tmp_path / "rtc") < 0
-
-
 def sealed(text: bytes) -> bytes:
     """As `state` writes it, whatever it is."""
     return b'{"crc32": "%08x", %s\n' % (zlib.crc32(text), text)
@@ -141,28 +112,10 @@ def test_the_one_before_is_kept(tmp_path: Path):
     assert sorted(tmp_path.iterdir()) == sorted([latest, before])
 
 
-def test_a_pipe_in_its_place_is_refused(tmp_path: Path):
-    os.mkfifo(tmp_path / "scooter.json")
-    with pytest.raises(ValueError, match="not a file"):
-        state.load(tmp_path / "scooter.json", NOW)
-
-
 def test_not_a_number_is_not_saved(tmp_path: Path):
     with pytest.raises(ValueError, match="JSON"):
         state.write(tmp_path / "scooter.json", state.encode({"soc": float("nan")}, NOW))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_directory_in_its_place_is_refused(tmp_path: Path):
-    (tmp_path / "scooter.json").mkdir()
-    with pytest.raises(ValueError, match="cannot be read"):
-        state.load(tmp_path / "scooter.json", NOW)
-
-
-def test_the_directory_is_made(tmp_path: Path):
-    file = tmp_path / "var" / "lib" / "scooter.json"
-    state.write(file, state.encode(SNAPSHOT, NOW))
-    assert state.load(file, NOW) == (SNAPSHOT, 0.0)
 
 
 def test_a_save_that_fails_leaves_the_old_one(tmp_path: Path):
@@ -200,33 +153,3 @@ def test_killed_at_any_time_it_leaves_a_whole_one(tmp_path: Path):
         assert snapshot["row"] == [snapshot["n"]] * 2000
         last = max(last, snapshot["n"])
     assert last > 1
-
-
-def test_a_state_by_a_link_is_that_of_its_target(tmp_path: Path):
-    target, link = tmp_path / "real" / "scooter.json", tmp_path / "link" / "mine.json"
-    for n in range(2):
-        state.write(target, state.encode({"n": n}, NOW))
-    link.parent.mkdir()
-    link.symlink_to("../real/scooter.json")
-    state.write(link, state.encode({"n": 2}, NOW))
-    assert link.is_symlink()
-    assert state.copies(link) == state.copies(target)
-    assert [state.load(copy, NOW) for copy in state.copies(target)] == [({"n": 2}, 0.0), ({"n": 1}, 0.0)]
-    assert [file.name for file in link.parent.iterdir()] == ["mine.json"]
-
-
-def test_a_name_that_cannot_be_looked_up_is_no_link(tmp_path: Path):
-    file = tmp_path / f"{'x' * 300}.json"
-    assert state.copies(file)[0] == file
-    with pytest.raises(ValueError, match="cannot be read"):
-        state.load(file, NOW)
-
-
-def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path):
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode(SNAPSHOT, NOW))
-    (tmp_path / "scooter.new").symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left"):
-        state.write(file, state.encode({"n": 2}, NOW))
-    assert list(tmp_path.iterdir()) == [file]
-    assert state.load(file, NOW) == (SNAPSHOT, 0.0)

@@ -133,13 +133,6 @@ def test_what_is_right_is_given(table):
     table.table("a").only(["value", "unit", "inner", "more"])
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "true"])
-def test_no_number_that_is_none(tmp_path, value):
-    (tmp_path / "t.toml").write_text(f"x = {value}")
-    with pytest.raises(InputError, match=r"t\.toml:1: x: "):
-        Table.read(tmp_path / "t.toml").number("x")
-
-
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
@@ -157,32 +150,6 @@ def test_a_file_that_is_not_toml(tmp_path, content, parts):
         Table.read(tmp_path / "t.toml")
     for part in ["t.toml", *parts]:
         assert part in str(caught.value)
-
-
-DEEP = ".".join("abcdefghijklmnopqrstuv")
-
-
-@pytest.mark.parametrize(
-    "line", [f"[{DEEP}]", f"[[ {DEEP.replace('.', ' . ')} ]]", f"{DEEP} = 1", f"x = {{ {DEEP} = 1 }}"]
-)
-def test_a_key_of_many_parts_is_refused(tmp_path, line):
-    """Reading it would take a time that grows with the square of their number."""
-    (tmp_path / "t.toml").write_text(f'text = """\n\n"""\n{line}\n')
-    with pytest.raises(InputError, match=r"t\.toml:4: .*too many parts"):
-        Table.read(tmp_path / "t.toml")
-
-
-def test_the_line_in_an_array_of_tables(tmp_path):
-    (tmp_path / "t.toml").write_text("[[ride]]\nfile = 1\n\n[[ride]]\nfile = 2\nlist = [\n  [1, 2],\n]\nlast = 3\n")
-    table = Table.read(tmp_path / "t.toml")
-    assert [line_of(ride.error("x", "file")) for ride in table.tables("ride", 5)] == [2, 5]
-    assert line_of(table.tables("ride", 5)[1].error("x", "last")) == 9
-    assert str(table.tables("ride", 5)[0].error("x", "file")).endswith(": ride.file: x")
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"none\.toml: cannot be read: No such file"):
-        Table.read(tmp_path / "none.toml")
 
 
 keys = st.from_regex(r"[a-z]{1,6}", fullmatch=True)

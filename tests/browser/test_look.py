@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from gz_onboard.events import NO_SENSOR, ROLES, Estimate, Reason, State
+from gz_onboard.events import Reason, State
 from tests.browser.support import plain, shows, texts, wait_for
 from tests.browser.test_page import UNREACHABLE
 from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
-from tests.display.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.display.test_picture import CHARGING, HEALTHY
 from tests.display.test_terminal import ESTIMATE
 
 SIZES = [(320, 240), (480, 320), (390, 844), (800, 480), (1280, 800)]
@@ -58,15 +58,6 @@ def test_day_and_night(page):
         assert ground(page) == black
 
 
-def test_it_works_where_storage_is_forbidden(page):
-    page.add_init_script("Object.defineProperty(window, 'localStorage', {get() { throw new Error('forbidden'); }});")
-    with dashboard("stored") as address, Sender("stored", HEALTHY):
-        page.goto(address)
-        shows(page, range_value="34")
-        page.click("#unit")
-        shows(page, range_value="21")
-
-
 @pytest.mark.parametrize("language", ["en", "de"])
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_it_fits(page, width, height, language):
@@ -93,51 +84,6 @@ def test_it_fits(page, width, height, language):
                 assert box["y"] >= 0
                 assert box["y"] + box["height"] <= height + (18 if place == "#band" else 0), place
             assert page.locator("#range-value").bounding_box()["height"] >= min(width, height) / 5
-
-
-EVERYTHING = replace(UNREACHABLE, reasons=~Reason(0), distrusted=tuple(ROLES))
-UNAVAILABLE = Estimate(time=0.0, state=State.INVALID, reasons=Reason.SIGNALS_SLOW | Reason.NO_GPS)
-NO_SCOOTER = Estimate(time=0.0, state=State.INVALID, reasons=NO_SENSOR)
-SEEN = "section *, header *, footer *, #alerts li:first-child"
-CLIPPED = (
-    f"() => [...document.querySelectorAll('{SEEN}')]"
-    + """.filter((e) => {
-  const box = e.getBoundingClientRect(), outer = (e.closest("section") ?? document.body).getBoundingClientRect();
-  const listed = e.closest("#state ul") && !e.matches("ul");  // a list ends where its place does
-  return e.checkVisibility() && !listed && (box.bottom > outer.bottom + 1 || box.right > outer.right + 1 ||
-    (e.matches("p, li") && e.scrollWidth > e.clientWidth + 1));
-}).map((e) => e.id || e.className || e.tagName)"""
-)
-
-
-@pytest.mark.parametrize("language", ["en", "de"])
-@pytest.mark.parametrize(("width", "height"), [(800, 480), (844, 390), (1024, 600), (1280, 800)])
-def test_in_landscape_nothing_scrolls_in_any_state(page, width, height, language):
-    page.set_viewport_size({"width": width, "height": height})
-    name = f"whole-{width}-{language}"
-    own = [odometer(1112.4), cells(-8, 24, 57)]
-    with dashboard(name, vehicle=vehicle_frames(1000.0)) as address, Sender(name, HEALTHY, own, 38) as sender:
-        page.goto(f"{address}?language={language}")
-        for estimate in HEALTHY, ESTIMATE, ON_ROUTE, CHARGING, UNREACHABLE, EVERYTHING, UNAVAILABLE:
-            sender.estimate = estimate
-            page.wait_for_timeout(1500)  # a range frame comes each second
-            assert texts(page)["trust"].startswith({State.VALID: "✓", State.DEGRADED: "!"}.get(estimate.state, "✕"))
-            assert page.evaluate("document.documentElement.scrollHeight <= innerHeight"), estimate
-            assert page.evaluate("document.documentElement.scrollWidth") == width
-            assert page.evaluate(CLIPPED) == [], estimate
-
-
-def test_the_scooter_is_waited_for(page):
-    """Sensors that never came are not lost; those that stop are."""
-    page.set_viewport_size({"width": 800, "height": 480})
-    with dashboard("before") as address, Sender("before", NO_SCOOTER) as sender:
-        page.goto(address)
-        shows(page, alerts="Waiting for the scooter.", trust_word="waiting", reasons="")
-        assert page.evaluate("document.documentElement.scrollHeight <= innerHeight")
-        sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
-        shows(page, alerts="", trust_word="degraded", range_value="34")
-        sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS | Reason.NO_IMU)
-        shows(page, alerts="Sensor lost: inertial unit.")
 
 
 def test_speed_clock_and_trend(page):
@@ -230,18 +176,3 @@ def test_a_screen_reader_hears_changes_of_state_and_not_every_tick(page):
         sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
         shows(page, announcer="Range degraded. Sensor lost: GPS.")
         assert page.evaluate("said.length") == 1
-
-
-def test_names_for_those_who_do_not_see(page):
-    with dashboard("names") as address, Sender("names", ON_ROUTE):
-        page.goto(address)
-        shows(page, route_left="18 km to go")
-        tree = plain(page.locator("body").aria_snapshot())
-        for shown in (
-            'region "Range"',
-            'region "Battery"',
-            'img "Range 34 km, between',
-            "The destination is 18 km away",
-        ):
-            assert shown in tree
-        assert 'list "Alerts"' in tree or page.is_hidden("#alerts")

@@ -9,10 +9,10 @@ from urllib.parse import urlsplit
 import pytest
 
 from gz_onboard.display.server import Feed, served
-from gz_onboard.events import Estimate, Reason, State
+from gz_onboard.events import Reason, State
 from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
 from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
-from tests.display.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.display.test_picture import HEALTHY, ON_ROUTE
 from tests.display.test_terminal import ESTIMATE
 
 UNREACHABLE = replace(
@@ -69,23 +69,6 @@ def test_everything_that_the_frames_say(page):
         assert middle / 2 == pytest.approx(34.21, abs=0.01)
 
 
-def test_what_cannot_be_kept_makes_no_range_less_certain(page):
-    reasons = Reason.LOG_FAILED | Reason.PRIOR_RIDING
-    with dashboard("kept") as address, Sender("kept", replace(HEALTHY, reasons=reasons)):
-        page.goto(address)
-        shows(
-            page,
-            meaning="All inputs present. The log cannot be written.",
-            reasons="wider interval: less than 3 km ridden",
-        )
-
-
-def test_a_charge(page):
-    with dashboard("charge") as address, Sender("charge", CHARGING):
-        page.goto(address)
-        shows(page, charge_power="620 W", charge_full="full in 2 h 05 min", charge_range="then 54 km", alerts="")
-
-
 def test_a_destination(page):
     with dashboard("route") as address, Sender("route", ON_ROUTE) as sender:
         page.goto(address)
@@ -130,21 +113,6 @@ def test_the_days_distance_and_the_cells(page):
         shows(page, alerts="Batteriezelle zu kalt: −8 °C.", cells="Zellen −8 bis −7 °C")
 
 
-def test_a_long_day_has_fewer_numbers_on_its_scale(page):
-    with dashboard("long", vehicle=vehicle_frames(1000.0)) as address, Sender("long", ON_ROUTE, [odometer(1060.0)]):
-        page.goto(address)
-        wait_for(lambda: page.inner_text("#band .ticks").split("\n") == ["−60", "0", "20", "40"], "fewer numbers")
-
-
-@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
-def test_without_an_estimate_there_is_no_number(page, state):
-    with dashboard(f"no-{state}") as address, Sender(f"no-{state}", Estimate(time=0.0, state=state)):
-        page.goto(address)
-        shows(page, trust_word=state.name.lower())
-        assert numbers(page) == []
-        assert (alerts(page) == ["Range unavailable."]) == (state is State.INVALID)
-
-
 def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
     with dashboard("quiet") as address:
         page.goto(address)
@@ -163,19 +131,6 @@ def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
         assert page.is_hidden("#band .between")
         with Sender("quiet", replace(HEALTHY, range=31_000.0)):
             shows(page, range_value="31", soc_value="62", alerts="", missing="")
-
-
-def test_the_server_gone_and_started_anew(page):
-    with Sender("gone", HEALTHY):
-        with dashboard("gone") as address:
-            page.goto(address)
-            shows(page, range_value="34")
-            page.evaluate("window.same = true")
-        shows(page, range_value="–", trust_word="unknown", alerts="Dashboard not responding. Trying again.")
-        assert numbers(page) == []
-        with dashboard("gone", urlsplit(address).netloc):
-            shows(page, range_value="34", trust_word="valid", alerts="")
-            assert page.evaluate("window.same")  # by itself, not by loading the page anew
 
 
 def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
@@ -211,24 +166,3 @@ def test_a_server_that_hangs(page):
             return texts(page)["range-value"] == "34"
 
         wait_for(back, "the range back")
-
-
-def test_a_reload(page):
-    with dashboard("reload") as address, Sender("reload", HEALTHY):
-        page.goto(address)
-        for _ in range(5):
-            shows(page, range_value="34", soc_value="62")
-            page.reload()
-        shows(page, range_value="34", soc_value="62")
-
-
-def test_a_page_that_nobody_looks_at_shows_nothing_old(page):
-    with dashboard("hidden") as address, Sender("hidden", HEALTHY):
-        page.goto(address)
-        shows(page, range_value="34")
-        hide = "(on) => { Object.defineProperty(document, 'hidden', {value: on, configurable: true});"
-        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", True)
-        shows(page, range_value="–")
-        assert numbers(page) == []
-        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", False)
-        shows(page, range_value="34")

@@ -50,14 +50,6 @@ def test_a_state_of_charge_in_percent_without_its_unit_is_not_taken_for_one(tmp_
     assert it.faults == {("M.Ambient", RANGE): 1}
 
 
-def test_no_cell_has_the_millivolts_of_one_as_volts(tmp_path: Path):
-    it = codec(tmp_path, roles=ROLES_OF_IT.replace("pack_voltage", "lowest_cell_voltage"))
-    for raw, value in ((3.5, 3.5), (3500.0, None), (6.1, None)):
-        ((_, group, found),) = events_of(it, [(10**18, 256, struct.pack("<hhf", 200, 300, raw), 0)])
-        assert dict(zip(it.groups[group].roles, found, strict=True))["lowest_cell_voltage"] == value
-    assert it.faults == {("M.Volts", RANGE): 2}
-
-
 def test_every_role_has_a_unit_of_which_it_is_said_what_is_plausible():
     assert set(ROLES.values()) == set(PLAUSIBLE)
     assert all(low <= 0 < high for low, high in PLAUSIBLE.values())

@@ -18,7 +18,7 @@ from gz_onboard.can.layout import crc8_sae_j1850
 from gz_onboard.can.mapping import read_mapping
 from gz_onboard.can.publisher import SIGMA, SOC, Counts, Publisher, reason_signal, sensor_signal
 from gz_onboard.errors import InputError
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Cause, Estimate, Explanation, Reason, State
+from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Cause, Estimate, Reason, State
 from gz_onboard.toml import Table
 from tests.events import events_of
 
@@ -39,12 +39,6 @@ QUANTITIES = {
     "RANGE_ArrivalStateOfChargeP10": ("arrival_soc_p10", 0.01),
     "RANGE_RouteLeft": ("route_left", 1000.0),
     "RANGE_BatteryEndsAfter": ("battery_ends_after", 1000.0),
-}
-COUNTS = {
-    "RANGE_CountDropped": "dropped",
-    "RANGE_CountImplausible": "implausible",
-    "RANGE_CountLost": "lost",
-    "RANGE_CountUnknown": "unknown",
 }
 
 
@@ -210,12 +204,6 @@ def test_never_valid_without_a_range(changes, state):
     assert (got["RANGE_Remaining"] is None) == (got["RANGE_RemainingP10"] is None) == (state is State.INVALID)
 
 
-def test_a_state_of_charge_without_its_sigma_is_not_told():
-    assert sent(Publisher(), replace(CAR, soc_sd=0.254))[SIGMA] == pytest.approx(25.4)
-    got = sent(Publisher(), replace(CAR, soc_sd=0.3))  # was 25.4: surer than it is
-    assert (got[SOC], got[SIGMA]) == (None, None)
-
-
 # --- another DBC file -------------------------------------------------------------------------------------------------
 
 
@@ -320,25 +308,7 @@ def test_a_file_that_cannot_be_sent_is_refused(old, new, told, tmp_path):
     assert str(caught.value).startswith(str(tmp_path / "mine.dbc"))
 
 
-def test_a_floating_point_signal_is_refused(tmp_path):
-    text = (
-        TEXT.replace("EnergyLeft : 0|16@1+ (0.1,0)", "EnergyLeft : 0|32@1- (1,0)")
-        .replace("Recent : 16|16", "Recent : 32|10")
-        .replace("Expected : 32|16", "Expected : 42|10")
-    )
-    (tmp_path / "mine.dbc").write_text(text + "SIG_VALTYPE_ 1537 RANGE_EnergyLeft : 1;\n")
-    with pytest.raises(InputError, match="RANGE_EnergyLeft must be an integer"):
-        Publisher(tmp_path / "mine.dbc")
-
-
 # --- counts, reasons, states, checks ----------------------------------------------------------------------------------
-
-
-@given(st.fixed_dictionaries({field: st.integers(0, 10**9) for field in COUNTS.values()}))
-def test_counts_stay_at_their_greatest(counts):
-    got = sent(Publisher(), Estimate(0.0), Counts(**counts))
-    for name, field in COUNTS.items():
-        assert got[name] == min(counts[field], signal_of(name).maximum)
 
 
 @given(st.integers(0, 2**16 - 1))
@@ -379,25 +349,6 @@ def test_states_are_named_in_the_dbc_as_in_the_code():
     for name in ("RANGE_WhyCause1", "RANGE_WhyCause2"):
         choices = {int(value): str(text).upper() for value, text in signal_of(name).choices.items()}
         assert choices == {cause.value: cause.name for cause in Cause}
-
-
-def test_the_two_largest_causes_are_sent_without_the_charge():
-    causes = {Cause.CHARGE: -20e3, Cause.SPEED: 1200.0, Cause.TEMPERATURE: -3420.0, Cause.UNEXPLAINED: -40.0}
-    why = Explanation(0.0, 56e3, 33.74e3, causes)
-    for file, scale in (("range.dbc", 0.1), ("range_large.dbc", 1.0)):
-        got = sent(Publisher(find_dbc(file)), replace(SCOOTER, why=why))
-        assert (got["RANGE_WhyCause1"], got["RANGE_WhyCause2"]) == (Cause.TEMPERATURE, Cause.SPEED)
-        assert (got["RANGE_WhyDistance1"], got["RANGE_WhyDistance2"]) == pytest.approx((-3.4, 1.2), abs=0.5 * scale)
-        assert got["RANGE_WhyRated"] == pytest.approx(56, abs=0.5 * scale)
-
-
-@pytest.mark.parametrize("causes", [None, {}, {Cause.WIND: 0.0, Cause.CHARGE: -5e3}, {Cause.WIND: math.nan}])
-def test_no_cause_is_sent_of_what_is_not_known(causes):
-    why = None if causes is None else Explanation(0.0, 1e6, 35e3, causes)
-    for estimate in (replace(SCOOTER, why=why), replace(SCOOTER, why=why, state=State.INVALID)):
-        got = sent(Publisher(), estimate)
-        assert (got["RANGE_WhyDistance1"], got["RANGE_WhyDistance2"], got["RANGE_WhyRated"]) == (None, None, None)
-        assert got["RANGE_WhyCause2"] == Cause.NONE
 
 
 def test_counters_and_checksums_as_a_receiver_checks_them():

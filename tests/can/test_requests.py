@@ -53,17 +53,6 @@ def test_what_the_file_says():
     assert kona().mapping.dbc_files == ()
 
 
-def test_a_pid_of_obd(tmp_path: Path):
-    file = changed(
-        tmp_path,
-        ("service = 0x22\ndata_identifier = 0x0105\nlength = 43", "service = 0x01\ndata_identifier = 0x5B\nlength = 1"),
-        ('{ byte = "AF", factor = 0.5,', '{ byte = "A", factor = 0.39215686,'),
-    )
-    codec = Codec(read_vehicle(file).mapping)
-    (event,) = events_of(codec, [(EPOCH, 0x7EC, carried(b"\x41\x5b\xff")[0], 0)])
-    assert event[2][0] == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("bus", ["", '[bus]\nidentifiers = "j1939"\n'])
 def test_identifiers_of_29_bits_are_exact_whatever_the_bus(tmp_path: Path, bus: str):
     changes = [("0x7E4", "0x18DA10F1"), ("0x7EC", "0x18DAF110")] * 2
@@ -140,15 +129,6 @@ def test_a_mistake_is_named_with_its_place(tmp_path, old, new, key, occurrence, 
     assert abs(int(place[1]) - line(key, occurrence)) <= new.count("\n"), (lines[int(place[1]) - 1], message)
 
 
-def test_requests_under_one_key_and_no_requests(tmp_path):
-    begin, end = TEXT.index("[[request]]"), TEXT.index("[roles]")
-    assert "must be tables under headers [[request]]" in refusal(changed(tmp_path, (TEXT[begin:end], "request = 3\n")))
-    many = "".join(f'[[request]]\nname = "r{i}"\n' for i in range(101))
-    assert "request: there are 101, the most are 100" in refusal(changed(tmp_path, (TEXT[begin:end], many)))
-    inline = "request = [{ name = 'a', request_identifier = 0x7E4, response_identifier = 0x7EC, servce = 1 }]\n"
-    assert re.search(r"toml:8: request.servce: unknown key", refusal(changed(tmp_path, (TEXT[begin:end], inline))))
-
-
 def test_identifiers_that_someone_has(tmp_path):
     (tmp_path / "own.dbc").write_text('VERSION ""\nBU_: A\nBO_ 2028 Old: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] "" A\n')
     message = refusal(changed(tmp_path, ("schema = 1", 'schema = 1\ndbc = ["own.dbc"]')))
@@ -189,17 +169,6 @@ def with_signal(folder: Path, signal: str) -> Vehicle:
     return read_vehicle(changed(folder, *changes))
 
 
-@settings(max_examples=40)
-@given(st.text("ABCXYZabcxyz", min_size=1, max_size=2))
-def test_letters_count_as_the_lists_of_pids_do(tmp_path_factory, letters):
-    order = [chr(65 + i) for i in range(26)]
-    order += [first + second for first in order[:26] for second in order[:26]]
-    place = order.index(letters.upper())
-    changes = ("length = 43", "length = 800"), ('byte = "AF"', f'byte = "{letters}"')
-    vehicle = read_vehicle(changed(tmp_path_factory.mktemp("v"), *changes))
-    assert vehicle.mapping.requests[1].message.signals[0].start == 8 * place + 7
-
-
 def test_answers_of_a_local_identifier_are_read(tmp_path: Path):
     """Service 0x21 of ISO 14230, as a Nissan Leaf answers it: one byte of identifier."""
     old = "service = 0x22\ndata_identifier = 0x0105"
@@ -209,10 +178,3 @@ def test_answers_of_a_local_identifier_are_read(tmp_path: Path):
     parts = enumerate(carried(payload(battery, BatteryCharge=60.0)))
     (event,) = events_of(codec, [(EPOCH + i * MS, 0x7EC, part, 0) for i, part in parts])
     assert event[2][0] == pytest.approx(0.6)
-
-
-@pytest.mark.parametrize("asked_on", ["0x7DF", "0x18DB33F1", "0x123"])
-def test_it_does_not_matter_on_which_identifier_a_tester_asks(tmp_path: Path, asked_on: str):
-    answer = ("0x7EC", "0x18DAF110") if len(asked_on) > 5 else ("0x7EC", "0x7EC")
-    vehicle = read_vehicle(changed(tmp_path, *[("0x7E4", asked_on), answer] * (1 if answer[0] == answer[1] else 2)))
-    assert vehicle.mapping.requests[0].request & ~EFF_FLAG == int(asked_on, 16)

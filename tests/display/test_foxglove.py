@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import struct
 import threading
 import time
@@ -21,7 +20,6 @@ from gz_onboard import cli
 from gz_onboard.can._can import can
 from gz_onboard.display import command as dashboard
 from gz_onboard.display import foxglove as command
-from gz_onboard.display.foxglove import LAYOUT
 from gz_onboard.display.vehicle_frames import VehicleFrames
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
@@ -30,7 +28,7 @@ from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 from tests.display import foxglove_clients
 from tests.display.broker import wait_for
-from tests.display.foxglove_clients import CLIENTS, FOLDER, documented
+from tests.display.foxglove_clients import CLIENTS, documented
 from tests.display.served import Sender
 from tests.display.test_terminal import ESTIMATE, send
 from tests.support import LOGS
@@ -139,21 +137,6 @@ def test_the_subprotocol_before_the_sdk_is_refused(monkeypatch):
         pass
 
 
-def test_the_library_is_pinned_by_hash_and_by_no_address():
-    lock = json.loads((FOLDER / "package-lock.json").read_text(encoding="utf-8"))
-    packages = [pinned for folder, pinned in lock["packages"].items() if folder]
-    assert packages
-    assert all("integrity" in pinned and "resolved" not in pinned for pinned in packages)
-
-
-def test_a_port_that_is_taken(monkeypatch, capsys):
-    with serving("f2", monkeypatch) as address:
-        place = address.removeprefix("ws://")
-        assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", place]) == 2
-    assert re.search(rf"--listen {place}: .*in use", capsys.readouterr().err)
-    assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", "nowhere"]) == 2
-
-
 @pytest.fixture(scope="module")
 def ridden() -> list[Frame]:
     """The frames of the first seconds of a recorded ride."""
@@ -212,21 +195,6 @@ def test_positions_of_a_truck_whoever_sends_them(tmp_path):
     frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
     (row,) = positions_of(positions, frames).values()
     assert (row["latitude"], row["longitude"]) == pytest.approx((48.1, 11.6))
-
-
-def test_the_layout_is_written_where_it_is_wanted(tmp_path, capsys):
-    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "layout.json")]) == 0
-    assert (tmp_path / "layout.json").read_bytes() == LAYOUT.read_bytes()
-    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "none" / "layout.json")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
-
-
-def test_a_vehicle_without_positions(tmp_path, capsys):
-    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
-    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"'))
-    arguments = ["--interface", "virtual", "--listen", "127.0.0.1:0", "--duration", "0.1"]
-    assert cli.main(["foxglove", *arguments, "--vehicle", str(tmp_path / "truck.toml")]) == 0
-    assert "truck.toml: [roles] must have latitude and longitude: no position is shown" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("client", CLIENTS)

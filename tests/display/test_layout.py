@@ -12,11 +12,10 @@ from mcap.reader import make_reader
 
 from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.events import Frame
-from gz_onboard.log_rows import LOCATION_SCHEMA, location_row
+from gz_onboard.log_rows import LOCATION_SCHEMA
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.vehicle import read_vehicle
-from tests.can.doctor import complaints
 from tests.support import LOGS, ROOT
 
 LAYOUT = ROOT / "gz_onboard" / "display" / "foxglove_layout.json"
@@ -54,19 +53,6 @@ def messages(log: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def test_the_doctor_has_nothing_to_say(log):
-    assert complaints(log) == []
-
-
-def test_the_doctor_sees_a_message_that_is_late(tmp_path):
-    recorder = Recorder(tmp_path, "late")
-    recorder.channel("/a", {"title": "a", "type": "object"})
-    for time_ns in 5, 4:
-        recorder.sample("/a", time_ns * 10**9, {})
-    recorder.close()
-    assert complaints(recorder.paths[0]) == ["/a: 1000000000 ns before the message before it"]
-
-
 def test_positions_are_fixes_that_foxglove_knows(log):
     found = messages(log)["/location"]
     assert SECONDS * 0.9 <= len(found) <= SECONDS + 1
@@ -84,11 +70,6 @@ def test_positions_are_fixes_that_foxglove_knows(log):
     assert summary is not None
     schemas = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
     assert {schemas["/location"], schemas["/battery_ends"]} == {"foxglove.LocationFix"}
-
-
-def test_an_altitude_that_is_not_known_is_not_there():
-    assert "altitude" not in location_row(1, "gps", 1.0, 2.0, None)
-    assert location_row(1_500_000_000, "gps", 1.0, 2.0, 3.0)["timestamp"] == {"sec": 1, "nsec": 500_000_000}
 
 
 def test_signals_have_the_time_at_which_they_were_seen(log):

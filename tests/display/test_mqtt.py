@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -23,12 +22,10 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.display import command as dashboard
 from gz_onboard.display import mqtt
-from gz_onboard.display.broker import Broker, read_login
 from gz_onboard.display.view import View
-from gz_onboard.errors import InputError
 from gz_onboard.events import Activity, State
 from tests.display.broker import Listener, broker, free_port, listening, wait_for
-from tests.display.served import PACK, Sender, cells, odometer
+from tests.display.served import Sender
 from tests.display.test_terminal import ESTIMATE
 
 STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
@@ -113,18 +110,6 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
     assert said == [f"connected to the broker 127.0.0.1:{port}"]  # that the bridge is ended says nothing of the broker
 
 
-def test_the_vehicles_own_frames(tmp_path, monkeypatch):
-    """Read by its file: the reference scooter's, where nothing else is said."""
-    port = free_port()
-    sender = Sender("m6", ESTIMATE, [PACK, odometer(1012.4), cells(22, 24, 53)])
-    with broker(tmp_path, port), listening(port) as listener, bridge(port, "m6", monkeypatch=monkeypatch), sender:
-        wait_for(lambda: seen(listener).get("alert") == "cell_too_hot", "a hot cell")
-        found = seen(listener)
-        assert [float(found[f"cell_temperature_{end}"]) for end in ("coldest", "hottest")] == [22.0, 53.0]
-        assert float(found["odometer"]) == 1012.4
-    assert seen(listener) == {}
-
-
 def test_of_a_bridge_that_is_killed_no_number_is_left(tmp_path):
     """A process of its own. It is killed on a bus that nobody else is on, so its state is rewritten as if of a ride."""
     port = free_port()
@@ -145,25 +130,6 @@ def test_of_a_bridge_that_is_killed_no_number_is_left(tmp_path):
         with listening(port) as late:
             wait_for(lambda: STATE in late.last, "what was kept")
             assert late.last[STATE]["status"] == "offline"
-
-
-def test_a_broker_that_is_not_there_and_goes_away(tmp_path, monkeypatch):
-    port = free_port()
-    monkeypatch.setattr("gz_onboard.display.broker.RETRY_S", (1, 2))
-    there = f"connected to the broker 127.0.0.1:{port}"
-    with bridge(port, "m2", monkeypatch=monkeypatch) as said, sending("m2"):
-        wait_for(lambda: bool(said), "that it is away is said")
-        (text,) = said
-        assert text.startswith(f"the broker 127.0.0.1:{port} cannot be reached: Connection refused")
-        with broker(tmp_path, port):
-            wait_for(lambda: said[-1] == there, "it is found")
-            assert len(said) == 2  # the attempts in between are not said
-            with listening(port) as listener:
-                wait_for(lambda: "range" in seen(listener), "the range")
-        wait_for(lambda: any("is gone" in line for line in said), "that it is gone is said")
-        with broker(tmp_path, port), listening(port) as listener:
-            wait_for(lambda: "range" in seen(listener), "the range again, to a broker that had forgotten all")
-    assert said.count(there) == 2
 
 
 def test_the_state_does_not_outlive_who_says_it(tmp_path, monkeypatch):
@@ -222,60 +188,9 @@ def test_encrypted(tmp_path, monkeypatch):
             assert "certificate" in said[0].lower()
 
 
-def test_units_and_classes_go_together():
-    """As Home Assistant's documentation has them; a pair that it does not know makes it drop the sensor."""
-    known = {"distance": "km", "battery": "%", "energy_storage": "Wh", "energy_distance": "Wh/km", "power": "W"}
-    known |= {"duration": "min", "temperature": "°C"}
-    about: Any = mqtt.discovery("scooter", STATE)
-    assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(mqtt.SENSORS)
-    for key, sensor in about["components"].items():
-        assert re.fullmatch("[a-z0-9_]+", key)
-        assert not hasattr(dict, key), "a template would find the method"
-        kind = sensor.get("device_class")
-        if kind == "enum":
-            assert "state_class" not in sensor
-            assert sensor["options"]
-        elif kind:
-            assert sensor["unit_of_measurement"] == known[kind]
-            assert sensor["state_class"] == ("total_increasing" if key == "odometer" else "measurement")
-
-
 def test_each_value_of_a_picture_has_a_sensor():
     picture = View().picture(0.0, "a", "virtual", True)
     assert mqtt.state_of(picture).keys() - {"status"} == mqtt.SENSORS.keys()
     long = mqtt.state_of(picture | {"state": "degraded", "reasons": ["no_imu"] * 100})["reasons"]
     assert len(long) <= 255
     assert set(long.split(", ")) == {"no_imu"}
-
-
-def broker_at(text: str, tls: str | None = None) -> Broker:
-    return Broker(text, "scooter", ("hello", b""), ("will", b""), print, tls=tls)
-
-
-@pytest.mark.parametrize("text", ["", "broker:", "broker:0", "broker:99999", "mqtt://broker", "a b", "::1"])
-def test_what_is_no_address(text):
-    with pytest.raises(InputError, match="must be HOST"):
-        broker_at(text)
-
-
-def test_addresses():
-    assert str(broker_at("broker.local")) == "the broker broker.local:1883"
-    assert str(broker_at("broker", "")) == "the broker broker:8883"
-    assert str(broker_at("[::1]:1884")) == "the broker [::1]:1884"
-
-
-def test_a_login_that_others_can_read(tmp_path: Path):
-    file = tmp_path / "login.toml"
-    file.write_text('user = "a"\npassword = "b"\n')
-    file.chmod(0o640)
-    with pytest.raises(InputError, match="chmod 600"):
-        read_login(file)
-
-
-def test_an_empty_login_is_none(tmp_path: Path):
-    file = tmp_path / "login.toml"
-    file.touch(0o600)
-    assert read_login(file) == (None, None)
-    file.write_text('user = "a"\n')
-    with pytest.raises(InputError, match="password: is missing"):
-        read_login(file)

@@ -15,7 +15,7 @@ from gz_onboard.can.publisher import Publisher, sensor_signal
 from gz_onboard.display.server import STATIC
 from gz_onboard.display.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.display.view import ALERTS, NEARLY_EMPTY, NO_LONGER_EMPTY, NO_NEWS, Picture, View, encoded
-from gz_onboard.events import KEEPING, NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
+from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.display.test_terminal import COUNTS, ESTIMATE, second, seen
 
 BUS = "vcan0", "socketcan", True
@@ -108,17 +108,6 @@ def test_an_old_number_is_not_given(after, gone, stay):
     assert all(has[name] for name in stay)
 
 
-def test_the_page_has_the_same_reasons_for_notes():
-    """Reasons for which no range is less certain."""
-    (names,) = re.findall(r"^const KEEPING = (\[.*\]);$", (STATIC / "draw.js").read_text(), re.MULTILINE)
-    assert json.loads(names) == [str(reason.name).lower() for reason in KEEPING]
-
-
-def test_a_state_is_not_older_than_the_status():
-    assert of(HEALTHY, 100.9)["state"] == "valid"
-    assert of(HEALTHY, 101.1)["state"] is None
-
-
 def test_what_is_late_is_said():
     assert of(ESTIMATE, 100.2)["late"] == []
     assert of(ESTIMATE, 100.4)["late"] == ["RANGE_Status"]
@@ -151,45 +140,8 @@ def test_alerts(estimate, alerts):
     assert of(estimate)["alerts"] == list(alerts)
 
 
-def followed(*estimates: Estimate) -> Picture:
-    """The picture after these, one a second."""
-    view, publisher = View(), Publisher()
-    for number, estimate in enumerate(estimates):
-        for frame in second(publisher, estimate):
-            view.take(frame, 100.0 + number)
-        found = view.picture(100.0 + number, *BUS)
-    return found
-
-
 STARTING = Estimate(time=0.0, reasons=NO_SENSOR)
 NO_SCOOTER = replace(STARTING, state=State.INVALID)
-WITHOUT_GPS = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
-AT_A_CHARGER = replace(CHARGING, soc=0.5)
-
-
-@pytest.mark.parametrize(
-    ("estimates", "alerts", "lost"),
-    [
-        ([STARTING], ("waiting",), Reason(0)),
-        ([STARTING, NO_SCOOTER], ("waiting",), Reason(0)),
-        ([STARTING, WITHOUT_GPS], (), Reason(0)),  # it never came
-        ([STARTING, HEALTHY, WITHOUT_GPS], ("sensor_lost",), Reason.NO_GPS),
-        ([HEALTHY, WITHOUT_GPS, STARTING, WITHOUT_GPS], (), Reason(0)),  # a daemon that was started again
-        ([AT_A_CHARGER, WITHOUT_GPS], (), Reason(0)),  # while charging it is not missed
-        ([STARTING, AT_A_CHARGER, HEALTHY, WITHOUT_GPS], ("sensor_lost",), Reason.NO_GPS),
-        ([HEALTHY, replace(NO_SCOOTER, activity=Activity.ASLEEP)], ("waiting",), NO_SENSOR),
-        ([HEALTHY, NO_SCOOTER], ("range_invalid", "sensor_lost"), NO_SENSOR),  # on the way
-        (
-            [replace(NO_SCOOTER, reasons=Reason.NO_PACK_VOLTAGE, activity=Activity.RIDING)],
-            ("range_invalid",),
-            Reason(0),
-        ),
-    ],
-)
-def test_only_a_sensor_that_came_is_lost(estimates, alerts, lost):
-    found = followed(*estimates)
-    assert found["alerts"] == list(alerts)
-    assert found["lost"] == [str(reason.name).lower() for reason in lost]
 
 
 def test_the_range_of_the_last_ten_minutes():
@@ -200,21 +152,6 @@ def test_the_range_of_the_last_ten_minutes():
         trend = view.picture(1000.0 + 10 * number, *BUS)["range_10min_km"]
     assert trend == pytest.approx([40 - number / 10 for number in range(20, 80)])
     assert view.picture(1805.0, *BUS)["range_10min_km"] == []  # nothing known now
-
-
-def test_alerts_of_a_bus():
-    assert View().picture(5.0, *BUS)["alerts"] == ["silent"]
-    assert View().picture(5.0, *BUS[:2], False)["alerts"] == ["bus_down", "silent"]
-    assert not View().picture(5.0, *BUS)["heard"]
-    assert of(HEALTHY, 105.0)["alerts"] == ["partly_silent"]  # the status is gone, the range not yet
-    assert of(HEALTHY, 1000.0)["alerts"] == ["silent"]
-
-
-def test_the_first_frame_is_not_partly_silent():
-    view = View()
-    for frame in Publisher().status(HEALTHY, 0):
-        view.take(frame, 1.0)
-    assert view.picture(1.0, *BUS)["alerts"] == []
 
 
 def test_a_battery_at_the_limit_does_not_flicker():
@@ -304,20 +241,9 @@ def test_there_is_a_word_for_everything(language):
     assert set(ALERTS) <= set(text["alerts"])  # type: ignore[call-overload]
 
 
-def test_both_languages_have_the_same_texts():
-    assert keys(words("en")) == keys(words("de"))
-
-
 def test_every_text_that_the_page_asks_for_is_there():
     page = "".join(path.read_text(encoding="utf-8") for path in STATIC.iterdir())
     asked = set(re.findall(r'data-word="(\w+)"', page)) | set(re.findall(r"\bwords\(\)\.(\w+)", page))
     asked |= set(re.findall(r'\bword\("(\w+)"', page))
     assert len(asked) > 25
     assert asked <= set(words("en"))
-
-
-def test_counts_are_those_of_the_view():
-    view = seen(HEALTHY)
-    frames = Publisher().range(HEALTHY, COUNTS, 0)
-    view.take((0, frames[0][1], b"\0" * 8, 0), 100.0)
-    assert view.picture(100.0, *BUS)["counts"]["bad"] == 1

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
 import pty
 import re
 import select
-import signal
 import struct
 import subprocess
 import sys
@@ -26,7 +24,7 @@ from gz_onboard.can.dbc import find_dbc
 from gz_onboard.can.publisher import Counts, Publisher
 from gz_onboard.display import terminal
 from gz_onboard.display.view import Picture, View
-from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State, words
+from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(
@@ -99,21 +97,6 @@ def test_it_shows_what_the_daemon_sends():
     assert "Stale" not in text
 
 
-def test_reasons_of_a_valid_estimate_widen_its_interval():
-    view = seen(replace(ESTIMATE, state=State.VALID, reasons=Reason.PRIOR_RIDING))
-    assert "Wider interval    less than 3 km ridden" in drawn(view, 100.0)
-
-
-@pytest.mark.parametrize("state", [State.VALID, State.DEGRADED])
-def test_what_cannot_be_kept_makes_no_range_less_certain(state):
-    reasons = Reason.LOG_FAILED | Reason.SAVE_FAILED | (Reason.SOC_RESTARTED if state is State.DEGRADED else Reason(0))
-    view = seen(replace(ESTIMATE, state=state, reasons=reasons))
-    text = drawn(view, 100.0)
-    assert "Note              log failed" in text
-    assert "Wider interval" not in text
-    assert ("Because           SOC restarted" in text) is (state is State.DEGRADED)
-
-
 def test_a_scooter_that_is_not_on_is_waited_for():
     view = seen(Estimate(time=0.0, state=State.INVALID, reasons=NO_SENSOR | Reason.LOG_FAILED))
     text = drawn(view, 100.0)
@@ -134,27 +117,6 @@ def test_an_old_number_is_never_shown_as_if_fresh():
         assert not numbers(text)
         assert "unknown" in text
         assert all(f" {name}\n" in text for name in view.messages)
-
-
-def test_a_late_number_is_grey():
-    grey, fresh = "\x1b[2m34.2 km", "\x1b[1;33m34.2 km"
-    assert fresh in drawn(seen(), 100.2, colour=True)
-    assert grey in drawn(seen(), 104.0, colour=True)
-
-
-def test_nothing_yet():
-    text = drawn(View(), 5.0)
-    assert "none yet" in text
-    assert "No frame of       range.dbc" in text
-    assert "Is --dbc its range_dbc?" in text
-    assert not numbers(text)
-
-
-@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
-def test_without_an_estimate_there_are_dashes(state):
-    text = drawn(seen(Estimate(time=1.0, state=state)), 100.0)
-    assert not numbers(text)
-    assert state.name.lower() in text
 
 
 @pytest.mark.parametrize("heard", [False, True])
@@ -198,15 +160,6 @@ def test_sensors_left_out_are_named():
     assert "GPS altitude" not in drawn(view, 111.0)  # stale
 
 
-def test_all_sensors_left_out_take_several_lines():
-    sendable = [s.name for s in Publisher().messages["RANGE_Sensors"].signals if s.length == 1]
-    view = seen(replace(ESTIMATE, distrusted=tuple(ROLES)))
-    assert len(at(view, 100.0)["distrusted"]) == len(sendable) > 20
-    text = drawn(view, 100.0)
-    assert "…" not in text
-    assert all(words(role) in re.sub(r"\s+", " ", text) for role in at(view, 100.0)["distrusted"])
-
-
 # --- range frames of another file ---------------------------------------------------------------------------------
 
 
@@ -231,30 +184,6 @@ def test_large_frames_by_their_own_file():
         assert shown in text
 
 
-@pytest.mark.parametrize(("sent", "read"), [("range.dbc", "range_large.dbc"), ("range_large.dbc", "range.dbc")])
-def test_by_the_wrong_file_there_is_nothing_rather_than_wrong_numbers(sent, read):
-    view = View(Publisher(find_dbc(read)))
-    for frame in second(Publisher(find_dbc(sent))):
-        view.take(frame, 100.0)
-    text = drawn(view, 100.0)
-    assert not numbers(text)
-    assert f"No frame of       {read}" in text
-
-
-def test_29_bits_and_a_counter_of_16(tmp_path):
-    file = tmp_path / "mine.dbc"
-    text = find_dbc("range.dbc").read_text().replace("1536", str(0x18FF6000 | 1 << 31)).replace("[0|14]", "[0|15]")
-    file.write_text(text.replace('BA_ "GenMsgCycleTime" BO_ 1538 100;', ""))
-    publisher, view = Publisher(file), View(Publisher(file))
-    for i in range(40):
-        for frame in second(publisher):
-            view.take(frame, 100.0 + i)
-    assert {entry.lost for entry in view.messages.values()} == {0}
-    assert {entry.bad for entry in view.messages.values()} == {0}
-    assert at(view, 140.0)["range"]["km"] == pytest.approx(34.21)
-    assert view.messages["RANGE_Status"].period == 0.1  # though its file does not say so
-
-
 def test_a_broken_frame_is_counted_and_not_shown():
     publisher, view = Publisher(), View()
     frame = publisher.range(ESTIMATE, COUNTS, 0)[0]
@@ -266,25 +195,6 @@ def test_a_broken_frame_is_counted_and_not_shown():
     view.take(frame, 1.0)
     assert at(view, 1.0)["range"]["km"] == pytest.approx(34.21)
     assert "5 bad" in drawn(view, 1.0)
-
-
-def test_counters():
-    publisher, view = Publisher(), View()
-    frames = [publisher.status(ESTIMATE, 0)[0] for _ in range(40)]
-    now = 0.0
-    for i, frame in enumerate(frames):
-        now += 0.1
-        if i not in (14, 15, 33):  # across the wrap too
-            view.take(frame, now)
-    entry = view.messages["RANGE_Status"]
-    assert (entry.received, entry.lost, entry.bad) == (37, 3, 0)
-    for _ in range(30):  # a sender that hangs and repeats its last frame
-        now += 0.1
-        view.take(frames[-1], now)
-    assert entry.bad >= 9
-    assert entry.bad + entry.received == 67
-    # It is stale in between; taken again only as after a pause, when the daemon may have been started anew.
-    assert at(view, entry.time + 1.05)["battery"]["soc_percent"] is None
 
 
 @given(
@@ -328,10 +238,6 @@ def test_every_line_fits(soc, sd, metres, width):
         assert len(line) <= min(width, 78)
 
 
-def test_without_colour_there_are_no_codes():
-    assert "\x1b" not in drawn(seen(), 100.0)
-
-
 # --- the command, on python-can's in-process bus ------------------------------------------------------------------
 
 
@@ -367,14 +273,6 @@ def test_once(capsys):
     assert status == 0
     assert "34.2 km" in text
     assert "\x1b" not in text
-
-
-def test_once_without_frames(capsys):
-    started = time.monotonic()
-    arguments = ["dashboard", "--interface", "virtual", "--channel", "none", "--once", "--duration", "0.3"]
-    assert cli.main(arguments) == 1
-    assert 0.2 < time.monotonic() - started < 2
-    assert "none yet" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -458,35 +356,6 @@ class Terminal:
         os.close(self.slave)
 
 
-@pytest.fixture
-def tty():
-    opened = Terminal()
-    yield opened
-    opened.close()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_on_a_terminal_and_left_as_it_was(tty, number):
-    child = start(out=tty.slave)
-    tty.until(r"34\.2 km")
-    tty.until("[1-9] bad")
-    assert tty.text.startswith("\x1b[?1049h\x1b[?25l")  # the other screen, no cursor
-    assert "\x1b[1;33m" in tty.text
-    frames = tty.text.count("\x1b[H")
-    tty.read(1.0)
-    child.send_signal(number)
-    tty.until(r"\x1b\[\?25h\x1b\[\?1049l")
-    assert child.wait(10) == 0
-    for _ in range(5):
-        tty.read(0.1)
-    assert frames >= 1
-    rest = tty.text.split("\x1b[?1049l")[1]
-    assert "34.2 km" in rest  # the last picture stays
-    assert termios.tcgetattr(tty.slave) == tty.before
-    assert child.stderr.read() == b""
-    child.stderr.close()
-
-
 def test_no_picture_is_larger_than_the_terminal():
     small = Terminal(rows=8, columns=40)
     child = start("--duration", "2", out=small.slave)
@@ -502,31 +371,6 @@ def test_no_picture_is_larger_than_the_terminal():
     small.close()
 
 
-def test_a_terminal_that_is_resized(tty):
-    child = start("--duration", "30", out=tty.slave)
-    tty.until(r"34\.2 km")
-    fcntl.ioctl(tty.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 5, 11, 0, 0))
-    tty.read(0.5)
-    tty.text = ""
-    tty.until(r"(?s)\x1b\[H.*\x1b\[H.*\x1b\[H")  # whole pictures after the first, which may be of the old size
-    child.send_signal(signal.SIGINT)
-    tty.until(r"\x1b\[\?1049l")
-    assert child.wait(10) == 0
-    screens = tty.text.split("\x1b[?1049l")[0].split("\x1b[H")[2:]
-    for lines in (re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", text)) for text in screens):
-        assert len(lines) <= 5
-        assert max(map(len, lines)) <= 11
-    child.stderr.close()
-
-
-def test_no_color_and_a_daemon_that_goes_silent(tty):
-    child = start("--duration", "4", out=tty.slave, sending=0.3, NO_COLOR="1")
-    tty.until(r"Stale +RANGE_Status", within=30)
-    assert child.wait(20) == 0
-    assert not re.search(r"\x1b\[[\d;]*[1-9][\d;]*m", tty.text)
-    child.stderr.close()
-
-
 def test_lines_where_there_is_no_terminal(tmp_path):
     with (tmp_path / "out").open("w+") as out:
         child = start("--duration", "3.5", out=out, PYTHONIOENCODING="ascii")
@@ -537,43 +381,3 @@ def test_lines_where_there_is_no_terminal(tmp_path):
         lines = out.read().splitlines()
     assert 2 <= len(lines) <= 4
     assert json.loads(lines[-1])["range"]["km"] == 34.21
-
-
-@pytest.mark.parametrize(
-    ("redirection", "status", "told"), [(">&-", 2, "no standard output"), (">/dev/full", 1, "No space left")]
-)
-def test_an_output_that_takes_nothing_is_told(redirection, status, told):
-    command = f'"$0" -m gz_onboard dashboard --interface virtual --channel none --duration 1.5 {redirection}'
-    run = subprocess.run(["sh", "-c", command, sys.executable], stderr=subprocess.PIPE, text=True, check=False)
-    assert run.returncode == status
-    assert run.stderr.startswith("gz-onboard dashboard: ")
-    assert told in run.stderr
-    assert len(run.stderr.splitlines()) == 1
-
-
-def test_a_dumb_terminal_gets_lines(tty):
-    child = start("--duration", "2.5", out=tty.slave, TERM="dumb")
-    tty.until(r'"range":{"km":34.21')
-    assert child.wait(10) == 0
-    assert "\x1b" not in tty.text
-    child.stderr.close()
-
-
-def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
-    import threading
-
-    class Tty(io.StringIO):
-        def isatty(self):
-            return True
-
-    out = Tty()
-    monkeypatch.setattr(sys, "stdout", out)
-    before = signal.getsignal(signal.SIGINT)
-    arguments = ["dashboard", "--interface", "virtual", "--channel", "thread", "--duration", "1.2"]
-    thread = threading.Thread(target=cli.main, args=(arguments,))
-    thread.start()
-    thread.join(10)
-    assert not thread.is_alive()
-    assert "\x1b" not in out.getvalue()
-    assert json.loads(out.getvalue().splitlines()[0])["alerts"] == ["silent"]
-    assert signal.getsignal(signal.SIGINT) is before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +16,13 @@ from gz_onboard.display.command import view_of
 from gz_onboard.display.vehicle_frames import RIDING_DEGC, VehicleFrames, cell_limits
 from gz_onboard.display.view import Picture, View
 from gz_onboard.estimator.signals import TIMING
-from gz_onboard.events import Activity, Estimate
+from gz_onboard.events import Estimate
 from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.model.tables import Derating
 from gz_onboard.vehicle import read_vehicle
 from tests.display.served import PACK, Own, cells, odometer, own_frame
 from tests.display.test_picture import BUS, HEALTHY
 from tests.display.test_terminal import second
-from tests.support import ROOT
 
 REFERENCE = read_vehicle("reference")
 DAY = 86_400 * 10**9
@@ -45,12 +43,6 @@ def test_cells_and_distance_are_those_of_the_frames():
     assert got["alerts"] == []
 
 
-def test_without_them_there_is_nothing():
-    got = of(HEALTHY)
-    assert (got["cells"], got["odometer_km"], got["ridden_today_km"]) == (None, None, None)
-    assert got["late"] == []
-
-
 def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
     """Its frames may have the same identifiers; a checksum of the reference scooter's they have not."""
     frames = VehicleFrames(REFERENCE)
@@ -64,51 +56,11 @@ def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
     assert frames.values(1.0)["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
 
 
-def test_a_checksum_that_is_right_by_chance_makes_no_vehicle():
-    """Of frames of any other content one in 256 has it."""
-    frames, chance = VehicleFrames(REFERENCE), random.Random(1)
-    for i in range(2000):
-        frames.take((NOON + i, own_frame(*PACK)[1], chance.randbytes(8), 0), 1.0)
-    frames.take(own_frame(*cells(21, 24, 155), NOON + 2000), 1.0)
-    assert frames.values(1.0)["cells"] is None
-
-
-@pytest.mark.parametrize(("after", "late", "there"), [(2.9, False, True), (3.1, True, True), (10.1, False, False)])
-def test_an_old_value_is_said_to_be_late_and_then_is_gone(after, late, there):
-    got = of(HEALTHY, odometer(1000.0), cells(21, 24, 55), after=after)
-    assert ("cell_temperature" in got["late"]) == ("odometer" in got["late"]) == late
-    assert (got["cells"] is not None) == (got["ridden_today_km"] is not None) == there
-    assert ("cell_too_hot" in got["alerts"]) == there
-
-
 def test_a_sensor_that_the_estimator_does_not_trust_is_not_shown():
     distrusted = replace(HEALTHY, distrusted=("cell_temperature", "odometer"))
     got = of(distrusted, odometer(1000.0), cells(21, 24, 55))
     assert (got["cells"], got["odometer_km"], got["ridden_today_km"]) == (None, None, None)
     assert "cell_too_hot" not in got["alerts"]
-
-
-@pytest.mark.parametrize(
-    ("activity", "own", "before", "alerts"),
-    [  # the controller of the reference scooter gives its full current from -5 to 50 degC
-        (Activity.RIDING, cells(-5, 0, 50), None, ()),
-        (Activity.RIDING, cells(20, 30, 51), None, ("cell_too_hot",)),
-        (Activity.RIDING, cells(-6, 0, 2), None, ("cell_too_cold",)),
-        (Activity.RIDING, cells(20, 30, 49), cells(20, 30, 51), ("cell_too_hot",)),
-        (Activity.RIDING, cells(20, 30, 47), cells(20, 30, 51), ()),
-        (Activity.RIDING, cells(-4, 0, 2), cells(-6, 0, 2), ("cell_too_cold",)),
-        (Activity.CHARGING, cells(0, 20, 45), None, ()),
-        (Activity.CHARGING, cells(-1, 0, 2), None, ("cell_too_cold",)),
-        (Activity.CHARGING, cells(20, 30, 46), None, ("cell_too_hot",)),
-    ],
-)
-def test_a_cell_that_is_too_hot_or_too_cold_is_an_alert(activity, own, before, alerts):
-    view = View(vehicle=VehicleFrames(REFERENCE))
-    for now, one in enumerate((before, own) if before else (own,)):
-        for frame in [*second(Publisher(), replace(HEALTHY, activity=activity)), own_frame(*PACK), own_frame(*one)]:
-            view.take(frame, 100.0 + now)
-        got = view.picture(100.0 + now, *BUS)
-    assert got["alerts"] == list(alerts)
 
 
 def test_limits_are_those_of_the_controller():
@@ -167,28 +119,6 @@ def test_a_damaged_file_is_begun_anew(tmp_path, text):
     assert json.loads(file.read_text())["odometer_km"] == 1000.0
 
 
-@pytest.mark.parametrize("changed", [{"vehicle": "another"}, {"odometer_km": 0.0}])
-def test_a_day_of_another_vehicle_is_begun_anew(tmp_path, changed):
-    """Of one with another name, or that would have been ridden further than can be in a day."""
-    file = tmp_path / "day.json"
-    assert ridden(file, (54_300.0, NOON), (54_301.0, NOON)) == pytest.approx(1.0)
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"odometer_km": 54_200.0} | changed))
-    assert ridden(file, (54_301.0, NOON), (54_303.0, NOON)) == pytest.approx(2.0)
-
-
-def test_an_odometer_that_goes_back_begins_anew(tmp_path):
-    assert ridden(tmp_path / "day.json", (1000.0, NOON), (10.0, NOON), (12.0, NOON)) == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("wrong", [0.0, 900.0, 4e6])
-def test_an_odometer_that_errs_for_some_seconds_makes_no_day(tmp_path, wrong):
-    """As of an ECU that has just been started."""
-    file = tmp_path / "day.json"
-    assert ridden(file, (1000.0, NOON), (1003.0, NOON), (wrong, NOON), (1004.0, NOON), lasts=60.0) == pytest.approx(4.0)
-    assert ridden(file, (1005.0, NOON), (wrong, NOON + DAY), (1006.0, NOON + DAY), lasts=60.0) == pytest.approx(1.0)
-    assert json.loads(file.read_text())["odometer_km"] == 1005.0
-
-
 @pytest.mark.parametrize("wrong", [0.0, 900.0, 1050.0, 4e6])
 def test_an_odometer_that_leaps_is_not_shown(wrong):
     """Nor sent to a broker, where a total that begins at 0 would count the whole life as ridden today."""
@@ -203,42 +133,9 @@ def test_an_odometer_that_leaps_is_not_shown(wrong):
     assert shown[-2:] == [None, 1000.1]
 
 
-def test_an_odometer_that_begins_with_nothing_makes_no_day(tmp_path):
-    file = tmp_path / "day.json"
-    assert ridden(file, (1000.0, NOON)) == 0.0
-    assert ridden(file, (0.0, NOON), lasts=2.0) is None
-    assert ridden(file, (0.0, NOON), (1008.0, NOON), lasts=2.0) == pytest.approx(8.0)
-    assert ridden(None, (0.0, NOON), (1008.0, NOON), (1009.0, NOON)) == pytest.approx(1.0)
-
-
-def test_a_board_that_does_not_know_the_time_yet_begins_no_day(tmp_path):
-    file = tmp_path / "day.json"
-    assert ridden(file, (1000.0, NOON), (1020.0, NOON)) == pytest.approx(20.0)
-    assert ridden(file, (1021.0, 0), (1022.0, 0)) is None
-    assert ridden(file, (1022.0, 0), (1023.0, NOON)) == pytest.approx(23.0)
-    assert ridden(file, (1024.0, 0), (1025.0, 0), (1026.0, NOON + DAY)) == pytest.approx(2.0)
-
-
-def test_a_file_that_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
-    assert ridden(tmp_path / "none" / "day.json", (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
-    assert "the start of the day is not kept" in capsys.readouterr().err
-
-
 # --- the command --------------------------------------------------------------------------------------------------
 
 WEB = ["dashboard", "--web", "--interface", "virtual", "--channel", "own", "--listen", "127.0.0.1:0"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "status"),
-    [
-        (["--vehicle", "reference"], 0),
-        (["--dbc", "range_large.dbc"], 0),
-        (["--vehicle", str(ROOT / "tests/vehicles/none.toml")], 2),
-    ],
-)
-def test_the_vehicle_of_the_page(arguments, status):
-    assert cli.main([*WEB, "--duration", "0.1", *arguments]) == status
 
 
 @pytest.mark.parametrize("own_frames", [True, False])
@@ -256,11 +153,6 @@ def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, own_
     assert view.picture(100.0, *BUS)["range"]["km"] == 34.21
 
 
-def test_only_the_page_keeps_a_day(capsys):
-    assert cli.main(["dashboard", "--day", "day.json", "--duration", "0.1"]) == 2
-    assert "--day day.json: only with --web" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("name", "said"), [(".", ".: is a folder"), ("", ".: is a folder"), ("v.toml", "would overwrite the input")]
 )
@@ -270,8 +162,3 @@ def test_a_day_that_cannot_be_kept_is_refused_at_the_start(tmp_path, monkeypatch
     assert cli.main(["vehicle", "new", "v.toml", *new, "--wheel-radius", "0.22"]) == 0
     assert cli.main([*WEB, "--duration", "0.1", "--vehicle", "v.toml", "--day", name]) == 2
     assert said in capsys.readouterr().err
-
-
-def test_a_day_is_of_a_vehicle(capsys):
-    assert cli.main([*WEB, "--duration", "0.1", "--dbc", "range.dbc", "--day", "day.json"]) == 2
-    assert "--day day.json: with --dbc alone no odometer is read" in capsys.readouterr().err

@@ -52,19 +52,6 @@ def test_a_quantity_learns_how_unlike_rides_are():
     assert np.sqrt(quantity.ride_variance) == pytest.approx(0.12, rel=0.35)
 
 
-def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
-    town, car = (Habits.before(PriorRiding(drift=drift), 0.02).price for drift in (0.055, 0.22))
-    assert car.scatter == pytest.approx(16 * town.scatter)
-
-
-def test_far_ahead_the_usual_counts_and_near_the_present():
-    quantity = LearnedQuantity(1.0, 0.001, 0.01, 0.01, deviation=0.2, deviation_variance=0.001)
-    near, far = quantity.ahead(1000.0), quantity.ahead(1e7)
-    assert near[0] == pytest.approx(1.2, abs=0.01)
-    assert far[0] == pytest.approx(1.0, abs=0.01)
-    assert far[1] == pytest.approx(0.001, rel=0.5)
-
-
 @pytest.mark.parametrize(("before", "most"), [(5, 16.0), (20, 16.0), (40, 16.0)])
 def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
     """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
@@ -127,38 +114,6 @@ def test_recent_consumption_is_that_of_about_the_last_kilometre():
     assert learner.expected(30e3, 20.0, 0.0).recent == pytest.approx(50.0)
     steady(learner, 1000, 900.0)
     assert learner.expected(30e3, 20.0, 0.0).recent == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
-
-
-def test_bursts_are_expected_from_about_the_last_twelve_kilometres():
-    """To twice the mean power, then none."""
-    learner = fresh()
-    for _ in range(200):
-        steady(learner, 100, 1000.0)
-        steady(learner, 100, 0.0)
-    bursts = learner.expected(30e3, 20.0, 0.0).form_factor_squared
-    assert learner.state.sums.distance == pytest.approx(12_000, rel=0.05)
-    steady(learner, 24_000, 500.0)
-    even = learner.expected(30e3, 20.0, 0.0).form_factor_squared
-    assert 2.0 < bursts < 2.4
-    assert even < bursts - 0.5
-
-
-def test_before_much_is_ridden_bursts_are_those_of_the_prior_riding():
-    learner = fresh()
-    assert learner.expected(30e3, 20.0, 0.0).form_factor_squared == pytest.approx(2.5)
-    steady(learner, 3000, 800.0)
-    expected = learner.expected(30e3, 20.0, 0.0)
-    assert 1.5 < expected.form_factor_squared < 2.0
-    assert not expected.mostly_prior or learner.state.sums.distance < 3000
-
-
-@pytest.mark.parametrize(("change", "taken"), [(10.0, True), (20.0, False)])
-def test_a_second_that_accelerates_as_no_road_allows_is_left_out(change, taken):
-    learner = fresh()
-    steady(learner, 100, 500.0)
-    before = learner._segment.distance
-    learner.ride(1.0, 10.0 + change, 0.0, 500.0, AIR)
-    assert (learner._segment.distance > before) == taken
 
 
 def test_a_segment_that_no_riding_explains_counts_for_little():

@@ -13,7 +13,6 @@ from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.events import Cause, Explanation
-from gz_onboard.log_rows import explanation_row
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -163,13 +162,6 @@ def test_cold_is_named_cells_and_air_alike():
     assert both.causes[Cause.TEMPERATURE] < cells.causes[Cause.TEMPERATURE] < air.causes[Cause.TEMPERATURE] < -500.0
 
 
-def test_the_payload_that_was_entered_is_named():
-    heavy = read_vehicle("reference", 150.0)
-    assert explained(forecaster(heavy)).reference == pytest.approx(explained(forecaster()).reference, rel=2e-3)
-    assert explained(forecaster(heavy)).causes[Cause.PAYLOAD] < -2000.0
-    assert explained(forecaster()).causes[Cause.PAYLOAD] == 0.0
-
-
 def test_the_wind_of_a_model_that_knows_one_is_named():
     model = VEHICLE.model
     windy = Model((*model.effects, load_effect("headwind")), model.parameters.replaced(wind_north=7.0))
@@ -178,21 +170,6 @@ def test_the_wind_of_a_model_that_knows_one_is_named():
     check_sum(why)
     assert why.reference == pytest.approx(explained(forecaster()).reference, rel=2e-3)
     assert why.causes[Cause.WIND] < -1000.0
-
-
-def test_bends_of_a_model_that_knows_their_loss_are_named():
-    model = VEHICLE.model
-    f, curvy = (
-        forecaster(replace(VEHICLE, model=Model((*model.effects, load_effect("cornering_drag")), model.parameters)))
-        for _ in range(2)
-    )
-    for each, lateral in ((f, 0.0), (curvy, 3.0)):
-        bends = MILD._replace(lateral_acceleration=lateral, heading=0.0)
-        for _ in range(600):
-            each.learner.ride(1.0, 10.0, 0.0, each.load.power(each.load.quantities(10.0, 0.0, MILD)), bends)
-    why = against(curvy, f)
-    check_sum(why)
-    assert why.causes[Cause.TURNING] < -500.0
 
 
 def test_cells_that_have_aged_are_named():
@@ -226,18 +203,6 @@ def test_a_heater_is_told_from_what_nobody_knows():
 # --- over time --------------------------------------------------------------------------------------------------------
 
 
-def test_a_cause_that_did_not_change_has_no_part_in_a_change():
-    f = forecaster()
-    explainer = RangeExplainer(f)
-    for time, soc in enumerate((0.7, 0.6)):
-        explainer.take(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
-    (change,) = explainer.changes
-    moved = {cause for cause, size in change.causes.items() if abs(size) > 1.0}
-    assert moved == {Cause.CHARGE, Cause.TEMPERATURE}  # with less charge the cells have less time to warm
-    assert change.causes[Cause.CHARGE] == pytest.approx(change.range - change.reference, rel=0.1)
-    check_sum(change)
-
-
 def test_a_charge_is_one_change_explained_when_it_is_over():
     f = forecaster()
     explainer = RangeExplainer(f)
@@ -253,46 +218,6 @@ def test_a_charge_is_one_change_explained_when_it_is_over():
     assert charged.time == 600.0
     for change in explainer.changes:
         check_sum(change)
-
-
-def test_what_is_ridden_as_expected_is_no_change():
-    f = forecaster()
-    explainer = RangeExplainer(f)
-    first = f.forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0)
-    explainer.take(0.0, first, 0.8, MILD, 0.0)
-    then = f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
-    explainer.take(500.0, then, 0.6, MILD, first.range - then.range)
-    assert not explainer.changes
-
-
-def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
-    f = forecaster()
-    ride(f, 3)
-    explainer = RangeExplainer(f)
-
-    def take(now: float) -> None:
-        explainer.take(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
-
-    take(0.0)
-    ride(f, 1.5, factor=2.5)
-    take(100.0)
-    f.forget(1500.0)
-    explainer.forget({"pack_voltage"})
-    take(200.0)
-    ride(f, 1.5, factor=2.5)
-    take(300.0)
-    assert [change.forgotten for change in explainer.changes] == [(), ("pack_voltage",), ()]
-    assert [explanation_row(change).get("forgotten") for change in explainer.changes] == [None, "pack_voltage", None]
-
-
-def test_the_split_is_made_seldom_and_not_of_a_range_that_stays():
-    f = forecaster()
-    explainer = RangeExplainer(f)
-    for second in range(400):
-        soc = 0.8 - second * 1e-6
-        explainer.take(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0)
-    assert len(explainer.news()) == 1
-    assert explainer.news() == []
 
 
 def test_what_was_ridden_survives_a_restart():

@@ -43,10 +43,6 @@ def run(vehicle, seconds, change=lambda events: events, plant=None):
     return e, np.array(innovations)
 
 
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 # --- the ledger ---------------------------------------------------------------------------------------------------
 
 
@@ -147,12 +143,6 @@ def test_a_snapshot_without_good_states_is_refused(damage, message):
         estimator(vehicle).restore({**e.snapshot(vehicle.key), **damage}, vehicle.key, 1.0)
 
 
-def test_a_snapshot_of_the_base_model_is_not_that_of_the_extended():
-    e, _ = run(BASE, 30)
-    with pytest.raises(ValueError, match="slow_relaxation"):
-        estimator(extended("slow_relaxation")).restore(e.snapshot(BASE.key), extended("slow_relaxation").key, 1.0)
-
-
 def test_slow_relaxation_leaves_less_to_be_drawn():
     at = (0.3, 0.01, 0.0, 1.0, 10.0, 0.0)
     base = Forecaster(BASE.model, BASE.pack, BASE.riding).forecast(*at)
@@ -192,26 +182,6 @@ def test_voltage_and_current_out_of_step_are_paired(late):
     assert jumps[2] > 2 * jumps[0]
 
 
-def test_no_voltage_of_long_ago_is_paired():
-    """After a pause what is from before it is of no use."""
-    vehicle = extended(pack_voltage_latency=0.3)
-
-    def pause(events):
-        return (event for event in events if not 100 < event[0] < 160)
-
-    _, with_pause = run(vehicle, 200, lambda events: pause(shifted(3)(events)))
-    assert np.abs(with_pause).max() < 0.05
-
-
-def test_a_speed_sensor_that_shows_too_much():
-    def fast(events):
-        return ((t, g, (v[0] * 1.05,) if g == MOTOR else v) for t, g, v in events)
-
-    way = run(BASE, 120)[0].motion.distance
-    assert run(BASE, 120, fast)[0].motion.distance == pytest.approx(1.05 * way)
-    assert run(extended(speed_sensor_scale=1.05), 120, fast)[0].motion.distance == pytest.approx(way)
-
-
 # --- the way to come ----------------------------------------------------------------------------------------------
 
 
@@ -237,21 +207,6 @@ def forecaster(vehicle):
     return Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
 
 
-def expected(f):
-    return f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0).consumption
-
-
-def test_of_bends_those_ridden_count():
-    vehicle = extended("cornering_drag")
-    straight, winding = (ride(forecaster(vehicle), vehicle.model, 6, radius=r) for r in (0.0, 40.0))
-    base = ride(forecaster(BASE), vehicle.model, 6, radius=40.0)
-    assert expected(winding) > 1.05 * expected(straight)
-    assert straight.learner.factor == pytest.approx(1.0, abs=0.02)
-    assert winding.learner.factor == pytest.approx(1.0, abs=0.02)  # the model explains it
-    assert base.learner.factor > 1.05  # there the factor must
-    assert expected(forecaster(vehicle)) > expected(forecaster(BASE))  # the prior has bends too
-
-
 def test_of_the_wind_the_mean_over_all_headings_is_expected():
     vehicle = extended("headwind", wind_north=4.0)
     north, south = (ride(forecaster(vehicle), vehicle.model, 4, heading=h) for h in (0.0, math.pi))
@@ -266,52 +221,3 @@ def test_of_the_wind_the_mean_over_all_headings_is_expected():
     # The mean of (v + w·cos ψ)² over all ψ is v² + w²/2.
     more = 0.5 * 1.2 * BASE.parameters["drag_area"] * 4.0**2 / 2
     assert levels[2] - levels[1] == pytest.approx(more, rel=0.35)  # and what the motor takes for it
-
-
-def test_cold_tyres_are_not_expected_for_the_rest_of_the_way():
-    vehicle = extended("tyre_warm_up", warm_up_share=1.0)
-    early, same = (ride(forecaster(each), vehicle.model, 0.6).learner.state.sums for each in (vehicle, BASE))
-    f = ride(forecaster(vehicle), vehicle.model, 3)
-    assert f.learner.factor == pytest.approx(1.0, abs=0.03)
-    warm = ride(forecaster(BASE), BASE.model, 3)
-    assert early.modelled > 1.2 * same.modelled
-    assert early.level == pytest.approx(same.level, rel=0.05)
-    assert expected(f) == pytest.approx(expected(warm), rel=0.05)
-
-
-def test_the_time_moving_outlives_a_restart():
-    vehicle = extended("tyre_warm_up")
-    f = ride(forecaster(vehicle), vehicle.model, 2)
-    again = forecaster(vehicle)
-    again.restore(json.loads(json.dumps(f.snapshot())))
-    assert again.load.time_moving == f.load.time_moving > 150
-
-
-def test_memory_between_road_and_pack_steps_each_second(tmp_path):
-    """A drag that comes up over a minute, as of a user's own file."""
-    (tmp_path / "slow_drag.py").write_text(
-        '"""A drag that comes up slowly."""\n'
-        "from gz_onboard.model.effect import Parameter, Port\n"
-        "from gz_onboard.model.functions import exp\n"
-        "PORT = Port.WHEEL_FORCE\n"
-        'PARAMETERS = (Parameter("slow_drag", "N", 20.0, 5.0, 0.0, 50.0, "made up for a test"),)\n'
-        "def term(speed, *, slow_drag):\n"
-        "    return slow_drag * (speed > 0.5)\n"
-        "def decay(dt):\n"
-        "    return exp(-dt / 60.0)\n"
-    )
-    effect = load_effect("slow_drag", tmp_path)
-    vehicle = BASE.changed(joined(BASE.parameters, [effect]), (*BASE.model.effects, effect))
-    fresh, settled = forecaster(vehicle), forecaster(vehicle)
-    settled.load.states["slow_drag"] = 20.0
-    shares = []
-    for kilometres in (0.3, 2):
-        one, other = (ride(f, BASE.model, kilometres).learner.state.recent.modelled for f in (fresh, settled))
-        shares.append(one / other)
-    assert shares[0] < 0.9
-    assert shares[1] > 0.95
-    assert 1 < fresh.load.states["slow_drag"] < 20
-    assert fresh.load.states["slow_drag"] == pytest.approx(settled.load.states["slow_drag"], rel=0.1)
-    again = forecaster(vehicle)
-    again.restore(json.loads(json.dumps(fresh.snapshot())))
-    assert again.load.states == fresh.load.states

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from math import exp
 
 import numpy as np
@@ -16,11 +15,9 @@ from gz_onboard.estimator import forecast as forecast_module
 from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.saved_state import check
-from gz_onboard.model.battery import Health
 from gz_onboard.model.drawable import cells_ahead, pack_constants
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Model
-from gz_onboard.model.parameters import Parameters
 from gz_onboard.offline.cooling import LumpedCooling
 from gz_onboard.vehicle import read_vehicle
 
@@ -75,14 +72,6 @@ def test_learns_what_the_model_has_wrong(factor):
     assert not result.mostly_prior
 
 
-def test_the_interval_narrows_with_riding():
-    f = forecaster()
-    before = forecast(f)
-    ride(f, 15)
-    after = forecast(f)
-    assert (after.p90 - after.p10) / after.range < 0.8 * (before.p90 - before.p10) / before.range
-
-
 def test_what_speed_stores_is_no_consumption():
     """Neither is what the wheels store: in a vehicle without losses, all of an acceleration can be had again."""
     model = Model((load_effect("inertia"),), VEHICLE.parameters)
@@ -103,27 +92,6 @@ def test_a_climb_is_not_taken_for_consumption():
     energy, way = ride(climbing, 8, grade=lambda x: 0.035)
     assert energy / way > 1.5 * forecast(level).consumption
     assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
-
-
-def test_a_descent_leaves_the_energy_that_can_be_drawn():
-    level, down = forecaster(), forecaster()
-    ride(level, 6)
-    ride(down, 6, grade=lambda x: -0.06)
-    assert forecast(down).energy > 0.97 * forecast(level).energy
-
-
-def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
-    seen, unseen = forecaster(), forecaster()
-    for f, told in ((seen, True), (unseen, False)):
-        v, x = 10.0, 0.0
-        while x < 6000:
-            q = f.load.quantities(v, 0.0, AIR)
-            q["grade"] = -0.05
-            f.learner.ride(0.1, v, -0.05 if told else None, sum(f.load.model.power(q).values()), AIR)
-            x += v * 0.1
-    assert unseen.learner.factor > 0.8
-    assert forecast(unseen).p10 < forecast(seen).range
-    assert forecast(unseen).consumption == pytest.approx(forecast(seen).consumption, rel=0.2)
 
 
 def roll(f, kilometres, grade, seed=0, drift=0.0, drive=0.0):
@@ -149,38 +117,6 @@ def test_metres_that_something_else_paid_for_teach_nothing(tows):
     assert towed.p10 == pytest.approx(usual.p10, rel=0.02)
     assert towed.p90 == pytest.approx(usual.p90, rel=0.02)
     assert f.learner.factor == pytest.approx(never_towed.learner.factor, rel=0.01)
-
-
-def test_a_tow_takes_nothing_off_the_range_shown():
-    f = forecaster()
-    ride(f, 8)
-    before = f.shown(forecast(f)).range
-    for _ in range(30):
-        roll(f, 0.1, grade=0.0)
-        shown = f.shown(forecast(f))
-    assert shown.range == pytest.approx(before, abs=500)
-
-
-@pytest.mark.parametrize("drift", [0.0, 0.008])
-def test_rolling_down_a_known_hill_is_still_riding(drift):
-    f, driven = forecaster(), forecaster()
-    for each, drive in (f, 0.0), (driven, 1000.0):
-        ride(each, 8)
-        roll(each, 4, grade=-0.0262, drift=drift, drive=drive)  # as much as keeps the speed
-    assert not f.learner.towed
-    assert f.learner.state.habits == driven.learner.state.habits
-
-
-def test_who_rides_in_mountains_has_a_wider_interval_over_a_restart_too():
-    """Up and down by 3 % for 4 km each, against a plain; the median expects neither."""
-    plain, mountains = forecaster(), forecaster()
-    ride(plain, 25)
-    ride(mountains, 25, grade=lambda x: 0.03 * (-1) ** int(x / 4000))
-    again = forecaster()
-    again.restore(json.loads(json.dumps(mountains.snapshot())))
-    flat, steep, kept = map(forecast, (plain, mountains, again))
-    assert steep.consumption_sd / steep.consumption > 1.5 * flat.consumption_sd / flat.consumption
-    assert (kept.p10, kept.p90) == pytest.approx((steep.p10, steep.p90))
 
 
 def test_uncertainty_of_soc_widens_the_interval():
@@ -233,15 +169,6 @@ def test_a_damaged_snapshot_is_refused(damage):
         check(declared, {**f.snapshot(), **damage})
 
 
-def test_a_saved_price_below_zero_is_refused():
-    f = forecaster()
-    saved = json.loads(json.dumps(f.snapshot()))
-    saved["state"]["habits"]["price"]["level"] = -1.0
-    check(forecast_module.FIELDS, saved)
-    with pytest.raises(ValueError, match="implausible habits"):
-        forecaster().restore(saved)
-
-
 def test_coverage_of_the_interval():
     """An 80 % interval holds about 80 % of the time: riders, winds and traffic drawn at random, of another code.
 
@@ -281,40 +208,6 @@ def test_what_a_liar_taught_is_unlearned():
     assert forecast(f).consumption == pytest.approx(before * forecast(f).consumption / f.learner.factor, rel=0.02)
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.6, 2.5])
-def test_what_was_forgotten_is_not_replaced_by_certainty(factor: float):
-    """It may be true all the same: the interval holds what was forecast before, and much riding narrows it again."""
-    f = forecaster()
-    ride(f, 3, seed=1)
-    narrow = forecast(f)
-    ride(f, 1.5, factor=factor, seed=2)
-    seen = forecast(f)
-    f.forget(1500.0)
-    doubted = forecast(f)
-    assert doubted.p10 < seen.range < doubted.p90
-    assert doubted.p90 / doubted.p10 > narrow.p90 / narrow.p10
-    ride(f, 6, seed=3)
-    again = forecast(f)
-    assert again.p90 / again.p10 < 1.1 * narrow.p90 / narrow.p10
-
-
-def test_nothing_from_before_a_restart_is_unlearned():
-    f = forecaster()
-    ride(f, 3)
-    again = forecaster()
-    again.restore(json.loads(json.dumps(f.snapshot())))
-    ride(again, 0.6)
-    again.forget(2000.0)
-    assert again.learner.state.habits.price.now == pytest.approx(f.learner.state.habits.price.now)
-
-
-def test_a_vehicle_whose_rides_change_has_a_wide_interval():
-    """Known to the same: only that the rest of a ride is less like its begin."""
-    town, far = (Forecaster(VEHICLE.model, VEHICLE.pack, replace(VEHICLE.riding, drift=d)) for d in (0.055, 0.25))
-    assert forecast(town).range == forecast(far).range
-    assert forecast(town).p90 / forecast(town).p10 < 0.8 * forecast(far).p90 / forecast(far).p10
-
-
 @pytest.mark.parametrize("watts", [20.0, 60.0, 300.0])
 def test_an_hour_at_standstill_adds_no_price(watts):
     """With the key on, taken in as riding or not: what was drawn is gone, a kilometre costs what it did."""
@@ -337,20 +230,6 @@ def test_an_hour_at_standstill_adds_no_price(watts):
         assert forecast(f).consumption == pytest.approx(before.consumption, rel=0.12)
 
 
-def test_the_usual_share_of_stops_belongs_to_the_riding_to_come():
-    """A minute of 200 W at each half kilometre costs 24 J/m; of them most is expected after 20 km, and stays so."""
-    with_stops, without = forecaster(), forecaster()
-    found = []
-    for k in range(4):
-        for i in range(40):
-            for f in (with_stops, without):
-                ride(f, 0.5, seed=40 * k + i, dt=0.5, stop_every=1e9)
-            for _ in range(60):
-                with_stops.learner.ride(1.0, 0.0, 0.0, 200.0, AIR)
-        found.append(forecast(with_stops).consumption - forecast(without).consumption)
-    assert all(12 < x < 30 for x in found)
-
-
 def test_another_ride_begins_with_what_is_usual():
     """Rides by turns cheap and dear: after ten, each start expects their mean, however the last one was."""
     f, expected = forecaster(), []
@@ -362,16 +241,6 @@ def test_another_ride_begins_with_what_is_usual():
     ride(even, 40, seed=99, dt=0.5)
     mean = forecast(even).consumption
     assert max(abs(x / mean - 1) for x in expected[8:]) < 0.06
-
-
-def test_a_ride_that_differs_is_followed_though_much_is_usual():
-    f = forecaster()
-    for i in range(10):
-        ride(f, 6, factor=(0.95, 1.05)[i % 2], seed=i, dt=0.5)
-        f.learner.pause(3600.0)
-    before = forecast(f).consumption
-    ride(f, 15, factor=1.3, seed=50, dt=0.5)
-    assert forecast(f).consumption > 1.12 * before
 
 
 def test_the_interval_encloses_the_newest_forecast_and_the_displayed_range():
@@ -389,15 +258,6 @@ def test_the_interval_encloses_the_newest_forecast_and_the_displayed_range():
     shown = f.shown(worse)
     assert shown.range > worse.p90
     assert (shown.p10, shown.p90) == (worse.p10, shown.range)
-
-
-def test_a_restart_keeps_what_was_shown():
-    f, again = forecaster(), forecaster()
-    ride(f, 4)
-    f.smoother.gap = -900.0
-    again.restore(json.loads(json.dumps(f.snapshot())))
-    assert again.shown(forecast(again)).range == pytest.approx(f.shown(forecast(f)).range, rel=1e-3)
-    assert again.shown(forecast(again)).p10 == pytest.approx(forecast(f).p10, rel=1e-3)
 
 
 @pytest.mark.parametrize("effects", [False, True])
@@ -419,43 +279,6 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effect
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
 
 
-@pytest.mark.parametrize("temperature", [-10.0, -5.0])
-@pytest.mark.parametrize(("capacity", "resistance"), [(1.0, 1.0), (0.85, 1.35), (0.8, 1.5)])
-def test_in_the_frost_the_range_does_not_fall_over_an_edge(capacity, resistance, temperature):
-    """Where cold cells no longer give what bursts ask for: they warm on the way all the same."""
-    pack = VEHICLE.pack.aged(Health(capacity, resistance))
-    f = Forecaster(VEHICLE.model, pack, VEHICLE.riding)
-    ranges = [f.forecast(soc, 0.01, temperature, 1.0, temperature, 0.0).range for soc in np.linspace(0.05, 1, 191)]
-    assert ranges[-1] > 0.6 * forecast(forecaster(), 1.0).range
-    assert np.abs(np.diff(ranges)).max() < 0.02 * ranges[-1]
-
-
-def test_a_vehicle_file_that_was_calibrated_anew_changes_nothing_of_what_was_ridden():
-    """A file with half as much drag and rolling again, restored from what was learned by the one before."""
-    known = dict(VEHICLE.parameters.known)
-    for name in ("drag_area", "rolling_resistance_constant"):
-        known[name] = replace(known[name], value=1.5 * known[name].value)
-    f = forecaster()
-    ride(f, 25)
-    f.ridden_by("another")
-    other = Forecaster(Model(VEHICLE.model.effects, Parameters(known)), VEHICLE.pack, VEHICLE.riding)
-    assert forecast(other).consumption > 1.2 * forecast(forecaster()).consumption
-    other.restore(json.loads(json.dumps(f.snapshot())))
-    assert forecast(other).consumption == pytest.approx(forecast(f).consumption, rel=0.03)
-    other.ridden_by("")
-    f.ridden_by("")
-    assert forecast(other).consumption == pytest.approx(forecast(f).consumption, rel=0.03)
-
-
-def test_tyres_are_cold_again_after_an_hour():
-    f = forecaster()
-    f.load.time_moving = 900.0
-    f.learner.pause(1800.0)
-    assert f.load.time_moving == 900.0
-    f.learner.pause(1800.0)
-    assert f.load.time_moving == 0.0
-
-
 def test_a_forecast_each_second_equals_one_from_nothing(monkeypatch):
     """The discharge is computed again only now and then: SOC, cells, air and load move on in between."""
     f, errors, energies, computed = forecaster(), [], [], []
@@ -473,11 +296,6 @@ def test_a_forecast_each_second_equals_one_from_nothing(monkeypatch):
     assert np.abs(errors).max() < 1e-3
     assert np.diff(energies).max() < 2e-4 * energies[0]
     assert len(computed) - len(errors) < len(errors) / 5
-
-
-def test_a_consumption_of_which_nothing_is_known_has_a_finite_interval():
-    result = forecaster().forecast(0.7, 0.0, 25.0, 0.0, 20.0, 0.0, loss_variance=25.0)
-    assert np.log(result.range / result.p10) == pytest.approx(1.28, rel=0.05)
 
 
 # --- P10 and P90 of energy and consumption together

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 from math import exp
-from typing import Any
 
 import pytest
 
-from gz_onboard.estimator.battery_priors import soc_from_voltage
-from gz_onboard.estimator.motion import MOTION
 from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
     BATTERY,
@@ -18,7 +15,6 @@ from tests.estimator.life import (
     MOTOR,
     OTHERS,
     PACK,
-    PERIOD,
     VEHICLE,
     Scooter,
     estimator,
@@ -117,59 +113,12 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
     )
 
 
-def test_of_a_thermostat_its_mean_is_to_come():
-    scooter, e = Scooter(soc=0.95), estimator(SENSED)
-    follow(e, with_auxiliary_current(scooter, 20), scooter)
-    rows: list[tuple[float, Any]] = []
-    energy = distance = 0.0
-    for minute in range(24):
-        if minute == 18:
-            energy, distance, shown = scooter.energy, scooter.distance, rows
-        for seconds, scooter.auxiliary in ((20, 400.0), (40, 45.0)):
-            rows = follow(e, with_auxiliary_current(scooter, seconds, 7.0), scooter)
-    price = (scooter.energy - energy) / (scooter.distance - distance)
-    assert all(row.consumption_expected == pytest.approx(price, rel=0.12) for _, row in shown)
-
-
-@pytest.mark.parametrize("plug", [0.0, None], ids=["plug signal", "none"])
-def test_charging_is_no_riding(plug):
-    scooter, e = Scooter(soc=0.56, plug=plug), estimator()
-    follow(e, scooter.live(20), scooter)
-    _, ridden = follow(e, scooter.live(600, 10.0), scooter)[-1]
-    hours, scooter.period = 0.2 * scooter.capacity / 10.0, 0.5
-    rows = follow(e, scooter.live(3600 * hours, charge=10.9), scooter)
-    scooter.period = PERIOD
-    assert all(row.activity is Activity.CHARGING for _, row in rows[10:])
-    _, charged = rows[-1]
-    assert charged.consumption_factor == pytest.approx(ridden.consumption_factor, abs=0.01)
-    rows = follow(e, scooter.live(200, 10.0), scooter)
-    _, end = rows[-1]
-    assert end.activity is Activity.RIDING
-    assert end.range / end.soc == pytest.approx(ridden.range / ridden.soc, rel=0.12)
-    assert worst(rows) < 3
-
-
 def test_a_plug_that_says_yes_for_ever_does_not_stop_the_learning():
     scooter, e = Scooter(), estimator()
     stuck = ((t, g, (v[0], 1.0) if g == 4 else v) for t, g, v in scooter.live(900, 10.0))
     rows = follow(e, stuck, scooter)
     assert rows[-1][1].activity is Activity.RIDING
     assert not rows[-1][1].reasons & Reason.PRIOR_RIDING
-
-
-def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
-    scooter, e = Scooter(), estimator()
-    follow(e, scooter.live(400, 10.0), scooter)
-    learner = e.forecaster.learner
-
-    def ridden():
-        return learner.state.sums.duration + learner._segment.duration
-
-    before = ridden()
-    follow(e, scooter.live(60), scooter)
-    assert ridden() - before == pytest.approx(60, abs=5)
-    follow(e, scooter.live(600), scooter)
-    assert ridden() - before == pytest.approx(MOTION.stop_time, abs=15)  # it comes to a stop first
 
 
 @pytest.mark.parametrize(("learned", "true"), [(1.0, 0.8), (0.8, 1.0)])
@@ -213,26 +162,6 @@ def test_a_rest_is_believed_the_more_the_longer_it_is():
     assert proven.soc_sd < 0.03
     assert long.soc_sd < 0.015
     assert worst(rows) < 2
-
-
-def test_after_a_load_a_short_stop_proves_nothing():
-    scooter = Scooter(soc=0.6)
-    scooter.away(900, 11.0)
-    scooter.speed = 0.0
-    e = estimator()
-    follow(e, scooter.live(20, 11.0), scooter)
-    before = e.pack.state.covariance[0]
-    rows = follow(e, scooter.live(40), scooter)
-    assert e.pack.state.covariance[0] > 0.5 * before
-    assert worst(rows) < 3
-
-
-def test_a_voltage_that_never_changes_proves_no_rest():
-    stuck, moving = estimator(), estimator()
-    for i in range(1000):
-        stuck.handle((0.1 * i, PACK, (52.0, 0.9, 0.5)))
-        moving.handle((0.1 * i, PACK, (52.0 + 0.01 * (i % 2), 0.9, 0.5)))
-    assert stuck.estimate(100.0).soc_sd > 1.3 * moving.estimate(100.0).soc_sd
 
 
 @pytest.mark.parametrize("time_constant", [0.3, 2.0, 5.0])
@@ -280,38 +209,6 @@ def test_cells_of_another_resistance_do_not_make_it_leave_a_right_estimate(resis
 # --- the pack's messages are lost -----------------------------------------------------------------------------------
 
 
-def without_pack(events):
-    """What comes while the battery's own controller and the inverter are silent and the others go on."""
-    return (event for event in events if event[1] not in (PACK, INVERTER))
-
-
-@pytest.mark.parametrize("own_soc", [True, False])
-def test_charged_while_only_the_pack_was_silent(own_soc):
-    scooter, e = Scooter(soc=0.3), estimator()
-    follow(e, heard(scooter.live(300, 9.0), own_soc=own_soc), scooter)
-    follow(e, scooter.live(30), scooter)
-    scooter.period = 0.5
-    follow(e, without_pack(scooter.live(1.25 * 3600, charge=12.0)), scooter)
-    scooter.period = PERIOD
-    rows = follow(e, heard(scooter.live(60), own_soc=own_soc), scooter)
-    true, end = rows[-1]
-    assert true > 0.6
-    assert abs(end.soc - true) < min(3 * end.soc_sd, 0.05)
-    assert all(abs(row.soc - true) < 3 * row.soc_sd for true, row in rows if row.soc is not None)
-
-
-def test_ridden_while_the_pack_was_silent_the_road_load_counts():
-    scooter, e = Scooter(soc=0.8), estimator()
-    follow(e, scooter.live(300, 9.0), scooter)
-    before = scooter.soc
-    lost = follow(e, without_pack(scooter.live(1200, 9.0)), scooter)
-    true, end = lost[-1]
-    assert end.reasons & Reason.NO_PACK_CURRENT
-    assert abs(end.soc - true) < 0.3 * (before - true)
-    assert worst(lost) < 3
-    assert worst(follow(e, scooter.live(600, 9.0), scooter)) < 3
-
-
 # --- restarts -------------------------------------------------------------------------------------------------------
 
 AWAY = [
@@ -356,52 +253,6 @@ def test_a_restart_knows_what_it_does_not_know(make, seconds, speed, charge, tol
     assert end.consumption_expected_sd < without.consumption_expected_sd
 
 
-def told_wrongly(events, seconds, own_soc=None, odometer=None):
-    """The events, of a vehicle that says so of itself for the first `seconds`."""
-    end = None
-    for t, group, values in events:
-        end = t + seconds if end is None else end
-        if t < end and group == PACK and own_soc is not None:
-            yield t, group, (*values[:2], own_soc)
-        elif t < end and group == OTHERS and odometer is not None:
-            yield t, group, (odometer, values[1])
-        else:
-            yield t, group, values
-
-
-@PACKS
-@pytest.mark.parametrize(
-    ("at", "wrong"),
-    [
-        ("asleep", {"own_soc": 0.0}),
-        ("asleep", {"own_soc": 1.0}),
-        ("asleep", {"odometer": 0.0}),
-        ("asleep", {"odometer": 3_250_000.0}),
-        ("waking", {"own_soc": 0.0}),
-        ("waking", {"odometer": 0.0}),
-    ],
-)
-def test_what_the_vehicle_says_of_itself_half_asleep_is_not_compared(make, wrong, at):
-    """It is not what it said a second before, and no charge flowed, no metre was ridden."""
-    scooter = make(soc=0.75)
-    e, whole = (estimator(vehicle=scooter.vehicle) for _ in range(2))
-    for event in [*scooter.live(30), *scooter.live(400, 10.0)]:
-        e.handle(event)
-        whole.handle(event)
-    events = list(scooter.live(60))
-    follow(whole, events, scooter)
-    follow(e, told_wrongly(events, 1e9, **wrong) if at == "asleep" else events, scooter)
-    scooter.away(7200)
-    e, whole = (restarted(each, 7200.0, scooter.vehicle) for each in (e, whole))
-    events = list(scooter.live(20))
-    rows = follow(e, told_wrongly(events, 3.0, **wrong) if at == "waking" else events, scooter)
-    follow(whole, events, scooter)
-    right = whole.estimate(scooter.time)
-    assert worst(rows) < 3
-    assert rows[-1][1].soc == pytest.approx(right.soc, abs=0.01)
-    assert rows[-1][1].soc_sd == pytest.approx(right.soc_sd, rel=0.2)
-
-
 def test_an_odometer_tells_what_was_ridden():
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, heard(scooter.live(30), own_soc=False), scooter)
@@ -414,23 +265,6 @@ def test_an_odometer_tells_what_was_ridden():
     told, untold = e.estimate(scooter.time), without.estimate(scooter.time)
     assert told.soc_sd < 0.7 * untold.soc_sd
     assert abs(told.soc - scooter.soc) < 0.01
-
-
-def test_twenty_one_power_cuts_cost_little():
-    """Each loses up to a second that was not yet saved, and two while the daemon starts."""
-    scooter, whole, e = Scooter(soc=0.8, seed=3), estimator(), estimator()
-    errors = []
-    for cut in range(22):
-        e = restarted(e, 3.0) if cut else e
-        for event in scooter.live(40, 10.0 if cut else 0.0):
-            e.handle(event)
-            whole.handle(event)
-        now, truth = scooter.time, scooter.soc
-        for event in scooter.live(3.0, 10.0):
-            whole.handle(event)
-        errors.append(abs(e.estimate(now).soc - truth) - abs(whole.estimate(now).soc - truth))
-    assert errors[-1] < 0.003
-    assert e.estimate(now).soc_sd < 1.5 * whole.estimate(now).soc_sd
 
 
 # --- slow messages --------------------------------------------------------------------------------------------------
@@ -479,56 +313,6 @@ def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
     assert rows[-1][1].range is not None
 
 
-def test_messages_that_come_in_bursts_are_integrated_over_their_long_gaps():
-    scooter, e, whole = Scooter(soc=0.8), estimator(), estimator()
-    begin = scooter.distance
-    for event in scooter.live(90):
-        e.handle(event)
-        whole.handle(event)
-    knows(e, scooter)
-    knows(whole, scooter)
-    rows, usual = [], []
-    for number in range(200):  # two samples 0.1 s apart, then 4 s of silence
-        if number == 20:
-            knows(e, scooter)
-            knows(whole, scooter)
-        burst = list(scooter.live(0.2, 10.0))
-        rows += follow(e, burst, scooter)
-        usual += follow(whole, burst, scooter)
-        follow(whole, scooter.live(3.9, 10.0), scooter)
-    _, end = rows[-1]
-    assert end.distance == pytest.approx(scooter.distance - begin, rel=0.1)
-    assert worst(rows) < 3
-    assert rows[1][1].soc_sd > 1.6 * usual[1][1].soc_sd  # the first gap: nobody knows yet that it is none
-    assert end.soc_sd > 1.08 * usual[-1][1].soc_sd  # later: what flows between two samples is not known
-
-
-@pytest.mark.parametrize(("seconds", "speed"), [(20.0, 10.0), (20.0, 24.0)])
-def test_what_flows_while_nothing_is_heard_is_not_known(seconds, speed):
-    scooter, e = Scooter(soc=0.7, seed=1), estimator()
-    follow(e, scooter.live(60), scooter)
-    knows(e, scooter)
-    scooter.away(seconds, speed)
-    assert worst(follow(e, scooter.live(1.0, speed), scooter)) < 3
-
-
-@pytest.mark.parametrize("told", [True, False])
-def test_the_wait_for_a_first_voltage_counts_as_age(told):
-    scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, heard(scooter.live(400, 10.0), own_soc=told, odometer=told), scooter)
-    waited, aged, young = restarted(e, 3.0), restarted(e, 60.0), restarted(e, 3.0)
-    waited.pack.wait(57.0)
-    scooter.away(60, 10.0)
-    events = list(heard(scooter.live(3, 10.0), own_soc=told, odometer=told))
-    sds = []
-    for each in (waited, aged, young):
-        follow(each, events, scooter)
-        sds.append(each.estimate(scooter.time).soc_sd)
-    assert sds[0] == pytest.approx(sds[1])
-    assert sds[2] != pytest.approx(sds[1], rel=0.2)
-    assert abs(waited.estimate(scooter.time).soc - scooter.soc) < 3 * sds[0]
-
-
 @pytest.mark.parametrize("age", [-5.0, float("nan"), float("inf"), -1e9])
 def test_an_age_that_is_none_is_not_known(age):
     scooter, e = Scooter(soc=0.75), estimator()
@@ -540,14 +324,6 @@ def test_an_age_that_is_none_is_not_known(age):
     assert rows == follow(unknown, events, scooter)
 
 
-@pytest.mark.parametrize("temperature", [-20.0, -10.0])
-@pytest.mark.parametrize("volts", [2.4, 2.8, 3.1])
-def test_a_first_state_of_charge_is_within_the_table(temperature, volts):
-    soc, sd = soc_from_voltage(BATTERY, volts, 2.0, temperature, 0.8, 0.8)
-    assert -0.02 <= soc <= 1.02
-    assert 0 < sd <= 0.5
-
-
 def test_a_sensor_that_twitches_at_standstill_is_no_motion():
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, scooter.live(20), scooter)
@@ -557,18 +333,6 @@ def test_a_sensor_that_twitches_at_standstill_is_no_motion():
     twitching = ((t, g, (4.0,) if g == MOTOR and t % 60 < 0.1 else v) for t, g, v in scooter.live(1200))
     follow(e, twitching, scooter)
     assert e.forecaster.learner._segment.duration == duration
-
-
-def test_a_charge_that_pauses_says_no_time_until_full():
-    scooter, e = Scooter(soc=0.5), estimator()
-    follow(e, scooter.live(20), scooter)
-    assert follow(e, scooter.live(60, charge=10.9), scooter)[-1][1].time_to_full
-    _, row = follow(e, scooter.live(5, charge=0.9), scooter)[-1]  # plugged in, and nothing flows into the pack
-    assert row.activity is Activity.CHARGING
-    assert row.time_to_full is None
-    _, row = follow(e, scooter.live(65, charge=0.9), scooter)[-1]
-    assert row.activity is Activity.PARKED
-    assert row.range_full is None
 
 
 @pytest.mark.parametrize("shown", [1.0, 3.0], ids=["plugged in", "not available"])
@@ -610,20 +374,6 @@ def test_a_charge_says_when_it_will_be_full_and_how_far_that_goes(start):
     assert ridden.range_full is None
 
 
-def test_a_state_of_charge_begun_anew_ends_what_was_held_back_of_the_range():
-    """As of a pack that was swapped: no gap of the one before; what the filter learns by and by leaves it."""
-    scooter, e = Scooter(), estimator()
-    follow(e, scooter.live(300, 10.0), scooter)
-    smoother = e.forecaster.smoother
-    smoother.gap = 4000.0
-    follow(e, scooter.live(1, 10.0), scooter)
-    assert smoother.gap > 3000
-    scooter.soc = 0.3
-    e.pack.state = e.pack.state._replace(soc=0.3)
-    follow(e, scooter.live(2, 10.0), scooter)
-    assert abs(smoother.gap) < 300
-
-
 def test_a_long_stop_is_parking_and_a_bus_that_falls_silent_then_is_asleep():
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(20), scooter)
@@ -660,48 +410,3 @@ def test_joined_mid_ride_it_says_so_until_a_rest_shows_the_state_of_charge():
     follow(e, scooter.live(3600), scooter)
     rows = follow(e, scooter.live(20, 11.0), scooter)
     assert rows[-1][1].activity is Activity.RIDING
-
-
-@pytest.mark.parametrize("leap", [200.0, 3000.0, 86_400.0])
-def test_a_clock_that_was_set_under_way_is_no_gap(leap):
-    """The odometer goes on, so nothing was missed."""
-
-    def ridden(leap):
-        scooter, e = Scooter(soc=0.8), estimator()
-        follow(e, scooter.live(20), scooter)
-        follow(e, scooter.live(420, 10.0), scooter)
-        scooter.time += leap
-        return e, follow(e, scooter.live(400, 10.0), scooter)[-1][1]
-
-    (e, end), (_, usual) = ridden(leap), ridden(0.0)
-    assert e.gap_time == 0.0
-    assert end.soc == pytest.approx(usual.soc, abs=0.001)
-    assert end.soc_sd == pytest.approx(usual.soc_sd, rel=0.05)
-    assert end.distance == pytest.approx(usual.distance, abs=30)
-    assert end.range == pytest.approx(usual.range, rel=0.01)
-    assert not end.reasons & ~usual.reasons
-
-
-@pytest.mark.parametrize("ridden", [10.0, 0.0])
-def test_a_gap_on_the_way_is_a_gap(ridden):
-    scooter, e = Scooter(soc=0.8), estimator()
-    follow(e, scooter.live(20), scooter)
-    follow(e, scooter.live(400, 10.0 if ridden else 0.0), scooter)
-    scooter.away(600, ridden)
-    follow(e, scooter.live(100, 10.0), scooter)
-    assert e.gap_time == pytest.approx(600, abs=5)
-
-
-@pytest.mark.parametrize("make", [Scooter, flat_pack])
-def test_a_current_that_shows_nothing_while_the_bus_is_awake_is_no_better_known_than_the_load(make):
-    """Many sensors show small currents as 0; of a pack with a flat voltage nothing corrects it."""
-    scooter = make(soc=0.9, offset=0.0)
-    e = estimator(vehicle=scooter.vehicle)
-    follow(e, scooter.live(30), scooter)
-    follow(e, scooter.live(300, 10.0), scooter)
-    knows(e, scooter)
-    scooter.period = 1.0
-    events = ((t, g, (v[0], 0.0, None) if g == PACK else v) for t, g, v in scooter.live(5 * 3600) if g != INVERTER)
-    rows = follow(e, events, scooter)
-    assert worst(rows) < 1.3
-    assert rows[100][1].soc_sd < 0.2 * rows[-1][1].soc_sd or make is Scooter

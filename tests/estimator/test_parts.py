@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from gz_onboard.estimator.battery_pack import PACK, InnovationTest, Synchroniser
+from gz_onboard.estimator.battery_pack import PACK, InnovationTest
 from gz_onboard.estimator.battery_priors import PRIOR, ChargeNoise, VoltageNoise
 from gz_onboard.estimator.plausibility.electrical import CurrentSource
-from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
-from gz_onboard.events import ROLES, WINDOW, Group, Reason
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import ROLES, Reason
 from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.model.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
-from tests.events import EventEstimator, ShownSignals
+from tests.events import ShownSignals
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
@@ -59,19 +59,6 @@ def test_a_model_that_is_blamed_is_believed_again_only_once_it_follows():
     assert followed[-1] == pytest.approx(LOAD)
 
 
-@pytest.mark.parametrize("latency", [0.2, -0.2])
-def test_voltage_and_current_are_of_one_time(latency):
-    late, early = (lambda t: 50.0 + t), (lambda t: 10.0 * t)
-    voltage, current = (late, early) if latency > 0 else (early, late)
-    synchroniser = Synchroniser(latency)
-    pairs = [synchroniser.pair(0.1 * i, voltage(0.1 * i), current(0.1 * i), 1.0) for i in range(30)]
-    assert pairs[:2] == [None, None]
-    known = pairs[-1]
-    assert known is not None
-    assert known == pytest.approx((voltage(2.9), current(2.7)) if latency > 0 else (voltage(2.7), current(2.9)))
-    assert synchroniser.pair(9.0, 60.0, 1.0, 1.0) is None, "nothing is interpolated over a pause"
-
-
 def test_errors_of_currents_go_with_the_size_of_the_pack():
     """No sensor at all: two packs of one cell, one ten times the other, lose their state of charge alike."""
     variances = []
@@ -84,23 +71,6 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
     assert variances[0] ** 0.5 == pytest.approx(0.46 / 60 * 2**0.5, rel=1e-3)
 
 
-def test_two_currents_that_differ_confirm_each_other_to_no_better():
-    battery, charge = BATTERY, 3600 * BATTERY.pack_capacity(25.0)
-    uncertainty = ChargeNoise(battery, VEHICLE.parameters)
-    sd = uncertainty.counted(3600.0, 0.0, charge, CurrentSource.PACK, 2.5) ** 0.5
-    assert sd > 2.5 * 3600 / charge, "as if it were an offset of that"
-
-
-def test_an_altitude_that_is_missing_is_no_full_position():
-    signals = everything()
-    missing = signals.missing
-    signals.gps_fix.value = 2.0
-    assert missing(1.0) == Reason.NO_GPS
-    signals.gps_fix.value = 3.0
-    signals.gps_altitude.time = -100.0
-    assert missing(1.0) == Reason.NO_GPS
-
-
 def test_a_signal_that_is_left_out_or_stale_is_a_reason():
     signals = everything()
     missing = signals.missing
@@ -110,38 +80,6 @@ def test_a_signal_that_is_left_out_or_stale_is_a_reason():
     signals.motor_speed.time = -10.0
     assert missing(1.0) == Reason.NO_IMU | Reason.NO_GPS
     assert missing(10.0) & Reason.NO_SPEED
-
-
-def test_a_fix_is_below_only_while_it_is_reported():
-    signals = everything()
-    signals.gps_fix.value = 2.0
-    assert signals.fix_below(1.0, FIX_3D)
-    assert not signals.fix_below(1.0, FIX_2D)
-    assert not signals.fix_below(10.0, FIX_3D)
-
-
-def started(voltage, seconds: float):
-    """(time [s] of the first state of charge, estimator); a pack with this voltage [V] over time and no current."""
-    groups = [Group("Pack", ("pack_voltage", "pack_current"), 0.1), Group("Motor", ("motor_speed",), 0.1)]
-    e = EventEstimator(groups, BATTERY, VEHICLE.model, VEHICLE.riding)
-    for step in range(round(seconds * 10) + 1):
-        e.handle((step / 10, 0, (voltage(step / 10), 0.0)))
-        e.handle((step / 10, 1, (0.0,)))
-        if e.pack.is_started:
-            return step / 10, e
-    return None, e
-
-
-def test_the_first_voltage_is_waited_for():
-    now, e = started(lambda t: 52.0, 5.0)
-    assert now <= PACK.steady_s + 2 * WINDOW
-    steady = e.estimate(now).soc
-    now, e = started(lambda t: min(20.0 + 40 * t, 52.0), 60.0)
-    assert e.estimate(now).soc == pytest.approx(steady, abs=0.01)
-    assert now == pytest.approx(PACK.resettled_s + 1.0, abs=2 * WINDOW)
-    now, e = started(lambda t: 50.0 + 4 * (t // WINDOW % 2), 100.0)
-    assert now == pytest.approx(PACK.longest_wait_s, abs=2 * WINDOW)
-    assert e.pack.state.covariance[0] ** 0.5 > 0.25  # nothing is known of it
 
 
 def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():

@@ -9,7 +9,7 @@ import pytest
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.plausibility.electrical import CellError, PackSensors
-from gz_onboard.estimator.plausibility.motion import GradeCheck, SpeedCheck, vote
+from gz_onboard.estimator.plausibility.motion import GradeCheck, SpeedCheck
 from gz_onboard.estimator.plausibility.residual import CONFIG, NO_SENSOR, LimitCheck, ResponseGain
 from gz_onboard.events import ROLES
 from gz_onboard.vehicle import read_vehicle
@@ -24,7 +24,6 @@ HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
     "vehicle_speed": 1.0,
     "gps_speed": 1.0,
 }
-AXLE_ROLES = "motor_speed", "wheel_speed_rear"
 FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
 Fault = Callable[[float, float], float | None]
 Each = Callable[[float, ShownSignals, SpeedCheck], None]
@@ -116,40 +115,6 @@ def test_a_roller_bench_and_a_spinning_wheel_are_no_faults():
         assert signals.motor_speed.trusted
 
 
-def test_a_driven_axle_at_a_constant_ratio_to_the_ground_is_no_wheelspin():
-    """Both in the wrong unit: wheels that spin for seconds hold no ratio, and on a roller bench the ground stands."""
-    late: Fault = lambda t, v: town(t - 1.0)  # noqa: E731
-    scaled: dict[str, Fault] = {"motor_speed": lambda t, v: 3.6 * v, "wheel_speed_rear": lambda t, v: 3.6 * v}
-    for roles in (FOUR, (*FOUR, "vehicle_speed")):
-        speeds, signals = ridden(120.0, roles, {**scaled, "vehicle_speed": lambda t, v: 3.6 * v, "gps_speed": late})
-        assert faulty(speeds.sensors) == set(roles) - {"wheel_speed_front", "gps_speed"}
-        assert signals.wheel_speed_front.trusted
-    speeds, _ = ridden(120.0, (*AXLE_ROLES, "gps_speed"), {**scaled, "gps_speed": late})
-    assert faulty(speeds.sensors) == {*AXLE_ROLES, "gps_speed"}, "nothing decides"
-
-
-def test_two_that_were_found_out_do_not_make_the_third_doubtful():
-    """The fourth, which decided, is silent: in a tunnel."""
-    before = ridden(60.0, FOUR, dict.fromkeys(AXLE_ROLES, lambda t, v: 3.6 * v))
-    speeds, signals = ridden(60.0, FOUR[:3], dict.fromkeys(AXLE_ROLES, lambda t, v: 3.6 * v), town, before, 60.0)
-    assert faulty(speeds.sensors) == set(AXLE_ROLES)
-    assert signals.wheel_speed_front.trusted
-
-
-def test_wheelspin_now_and_then_is_no_fault():
-    spins: Fault = lambda t, v: v * (2 + sin(t)) if t % 30 < 8 else v  # noqa: E731
-    speeds, _ = ridden(600.0, FOUR, dict.fromkeys(AXLE_ROLES, spins))
-    assert faulty(speeds.sensors) == set()
-
-
-def test_a_vehicle_speed_made_from_the_motors_does_not_outvote_the_gps():
-    roles = ("motor_speed", "vehicle_speed", "gps_speed")
-    double: Fault = lambda t, v: 2 * v  # noqa: E731
-    speeds, _ = ridden(60.0, roles, {"motor_speed": double, "vehicle_speed": double})
-    assert faulty(speeds.sensors) == set(roles)
-    assert faulty(ridden(60.0, roles, {"motor_speed": double})[0].sensors) == {"motor_speed"}
-
-
 def test_of_two_that_disagree_the_stuck_one_is_faulty():
     for wrong_role in ("motor_speed", "gps_speed"):
         speeds, _ = ridden(60.0, ("motor_speed", "gps_speed"), {wrong_role: lambda t, v: 40.0})
@@ -193,28 +158,11 @@ def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
     assert signals.wheel_speed_front.trusted
 
 
-def test_votes():
-    apart = dict.fromkeys(HONEST, 1.0)
-    assert vote({"motor_speed": 5.0, "wheel_speed_rear": 9.0, "gps_speed": 9.5}, apart)[0] == {"motor_speed"}
-    assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NO_SENSOR, frozenset({"motor_speed", "gps_speed"}))
-    two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
-    assert vote(two_and_two, apart) == (NO_SENSOR, frozenset(two_and_two))
-
-
 # --- currents -----------------------------------------------------------------------------------------------------
 
 
 def sag_of_a_cell() -> ResponseGain:
     return ResponseGain(CONFIG.sag_mean_s, CONFIG.settled_s, CONFIG.sag_least_v2s)
-
-
-@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_the_sag_shows_what_a_current_leaves_unexplained(scale: float):
-    sag = sag_of_a_cell()
-    for step in range(3000):
-        current = 40.0 * (1 + sin(step * STEP))
-        sag.update(STEP, 0.002 * scale * current, 0.002 * current + 1e-5 * step)
-    assert sag.ratio == pytest.approx(1 / scale, rel=0.05)
 
 
 def test_a_current_that_moves_the_voltage_explains_it():
@@ -228,13 +176,6 @@ def test_a_current_that_moves_the_voltage_explains_it():
             assert stuck.explained
     assert right.explained
     assert not stuck.explained
-
-
-def test_a_steady_current_shows_no_sag():
-    sag = sag_of_a_cell()
-    for step in range(3000):
-        sag.update(STEP, 0.04, 1e-5 * step)
-    assert sag.ratio is None
 
 
 VEHICLE = read_vehicle("reference", 75.0)
@@ -444,16 +385,6 @@ def test_a_single_witness_of_the_grade_is_held_against_the_energy():
         assert hills(800.0, {role: fault}, (role,)).faulty == {role}
 
 
-def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
-    still: Fault = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
-    assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).faulty == NO_SENSOR
-
-
-def test_the_mounting_is_kept_from_before_the_fault():
-    grades = hills(800.0, {"gps_altitude": lambda t, v: v + t})
-    assert grades.check.offset == pytest.approx(-MOUNTED, abs=0.006)
-
-
 def brisk(t: float) -> float:
     """The true speed [m/s]: stops and goes, with 1.5 m/s²."""
     return max(0.0, 7.0 + 6.0 * sin(t / 4.0))
@@ -493,13 +424,6 @@ GPS: dict[str, Fault] = {
 }
 
 
-@pytest.mark.parametrize("name", GPS)
-def test_a_gps_speed_that_is_held_does_not_contradict_the_accelerometer(name: str):
-    """Its mean with a new speed of the motor gained half of what the vehicle did, and the rest in one step."""
-    for roles in (("motor_speed",), FOUR[:3]):
-        assert beside_speeds({**dict.fromkeys(roles, every(1)), "gps_speed": GPS[name]}).faulty == NO_SENSOR
-
-
 ACCELEROMETERS: dict[str, Fault] = {
     name: GRADE_FAULTS[name][1] for name in ("doubled", "turned round", "stuck", "full scale")
 } | {"halved": lambda t, v: v / 2, "zero but for its tremor": lambda t, v: 0.1 * sin(77 * t)}
@@ -510,18 +434,6 @@ ACCELEROMETERS: dict[str, Fault] = {
 def test_a_wrong_accelerometer_is_found_beside_a_gps_speed_however_seldom(gps: str, name: str):
     speeds = {"motor_speed": every(1), "gps_speed": GPS[gps]}
     assert beside_speeds(speeds, ACCELEROMETERS[name]).faulty == {"accel_x"}
-
-
-def test_speeds_that_are_all_held_show_no_acceleration():
-    seldom = dict.fromkeys(("motor_speed", "gps_speed"), every(10))
-    assert beside_speeds(seldom).faulty == NO_SENSOR
-    assert beside_speeds(seldom, ACCELEROMETERS["stuck"]).faulty == {"accel_x"}
-
-
-def test_of_a_speed_that_is_left_out_nothing_is_followed():
-    """The motor stands still, the GPS at 1 Hz does not: from then on there is no acceleration to compare."""
-    stuck: Fault = lambda t, v: v if t < 30 else 40.0  # noqa: E731
-    assert beside_speeds({"motor_speed": stuck, "gps_speed": every(10)}).faulty == NO_SENSOR
 
 
 def test_pulling_away_on_a_slope_is_no_fault():

@@ -55,15 +55,6 @@ def test_who_never_rode_is_taken_for_the_one_before_but_less_surely():
     assert f.learner.state.habits.factor == known.factor, "errors of the parameters are the vehicle's"
 
 
-def test_the_same_rider_again_changes_nothing():
-    f = forecaster()
-    f.ridden_by("anna")
-    rides(f, 1.2)
-    before = f.snapshot()
-    f.ridden_by("anna")
-    assert f.snapshot() == before
-
-
 def test_riders_do_not_fill_the_state():
     f = forecaster()
     for number in range(3 * CONSUMPTION.most_riders):

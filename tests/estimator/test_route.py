@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,9 +13,9 @@ from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
-from gz_onboard.estimator.route import HeightCheck, PreparedRoute, RouteForecaster
+from gz_onboard.estimator.route import PreparedRoute, RouteForecaster
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
-from gz_onboard.model.drawable import Drawable, drawable, soc_left
+from gz_onboard.model.drawable import Drawable
 from gz_onboard.routes.route import Route
 from tests.events import ShownSignals
 from tests.support import reference
@@ -99,27 +98,6 @@ def test_arrival_and_range_on_a_short_route():
     assert answer.arrival_soc_p10 < answer.arrival_soc < answer.arrival_soc_p90 < 0.7
 
 
-def test_near_the_end_of_a_route_the_charge_there_is_known_as_well_as_here():
-    answer = Rider(way(40.0)).settled()[1]
-    assert answer.arrival_soc == pytest.approx(0.7, abs=0.002)
-    assert (answer.arrival_soc - answer.arrival_soc_p10, answer.arrival_soc_p90 - answer.arrival_soc) == pytest.approx(
-        (0.0128, 0.0128), rel=0.05
-    )
-
-
-def test_another_route_begins_from_the_consumption_factor():
-    """A route that was not the road teaches nothing for the next."""
-    rider = Rider(way(30e3))
-    rider.settled()
-    costs = rider.forecast.costs
-    assert costs
-    rider.ride(700, 3.0 * costs.level[-1] / 30e3 * 11.0)
-    assert rider.forecast.cost > 2.0
-    rider.forecast.follow(rider.forecast.prepare(way(20e3)))
-    rider.ask()
-    assert rider.forecast.cost == rider.forecaster.learner.factor
-
-
 def test_a_route_shows_at_once_and_so_does_its_end():
     """Before the first metre, and again when it is taken back: nothing of it waits for riding."""
     rider = Rider(way(60e3))
@@ -156,14 +134,6 @@ def test_hills_ahead_are_called_that(grade):
     assert hilly.causes[Cause.RIDING] == pytest.approx(level.causes[Cause.RIDING], rel=0.01)
 
 
-def test_no_pack_is_better_than_new_on_a_route_either():
-    found, answer = Rider(way(60e3)).settled(FREE._replace(energy_sd=6e5))
-    alike, same = Rider(way(60e3)).settled()
-    assert found.p10 < 0.95 * alike.p10
-    assert found.p90 == pytest.approx(alike.p90)
-    assert answer.arrival_soc_p90 == pytest.approx(same.arrival_soc_p90)
-
-
 def test_where_the_battery_ends():
     found, answer = Rider(way(60e3)).settled()
     assert found.range == answer.battery_ends_after < 60e3
@@ -177,14 +147,6 @@ def test_a_climb_costs_its_height_and_a_fall_gives_less_back():
     weight = 185.0 * 9.80665 * 400.0
     assert weight < up - level < 1.5 * weight
     assert 0.5 * weight < level - down < up - level  # the motor loses more, the more it gives
-
-
-def test_the_hill_that_is_past_counts_no_more():
-    rider = Rider(way(10e3, lambda x: 0.05 if x < 2e3 else 0.0))
-    before = rider.settled()[1].route_energy
-    rider.ride(200, 0.0)
-    assert rider.forecast.outlook.route_left == pytest.approx(7.8e3)
-    assert before - rider.forecast.outlook.route_energy > 185 * 9.8 * 100
 
 
 def test_faster_roads_stops_and_headwind_cost_more():
@@ -214,16 +176,6 @@ def test_on_a_route_the_forecast_is_known_from_what_was_ridden_of_it():
     later = rider.ask().known_from
     assert early < 1500 < 5000 < later
     assert Rider(way(1e3)).settled()[0].known_from == pytest.approx(FREE.known_from, rel=0.05)
-
-
-def test_a_slow_climb_makes_no_slow_rider():
-    """At the pace of the first, steep kilometres no map's level roads would be ridden, nor cost less."""
-    rider = Rider(way(30e3, limit=lambda x: 12.0))
-    rider.settled()
-    before = rider.forecast.costs
-    rider.ride(300, 1000.0, speed=6.0)
-    assert before
-    assert rider.forecast.costs is before
 
 
 def test_off_the_route_it_is_as_without_one_and_comes_back():
@@ -263,18 +215,6 @@ def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
     assert shown == pytest.approx(raw)
 
 
-def test_what_a_route_made_of_the_range_is_not_kept_over_a_restart():
-    """Which forgets the route: the next day's range is that without, not yesterday's with a descent."""
-    rider = Rider(way(20e3))
-    smoother = rider.forecaster.smoother
-    rider.settled()
-    smoother.gap = 9e3
-    assert smoother.snapshot() == {"gap": 0.0, "forecast": None}
-    rider.forecast.follow(None)
-    rider.forecaster.shown(rider.ask())
-    assert smoother.snapshot()["forecast"] == [FREE.range, FREE.energy]
-
-
 @pytest.mark.parametrize("slope", [-0.05, 0.05])
 def test_a_route_with_other_hills_than_are_ridden_is_left_and_taken_up_again(slope):
     """Heights of another road: for a kilometre it is believed, then the range is that without it."""
@@ -285,32 +225,6 @@ def test_a_route_with_other_hills_than_are_ridden_is_left_and_taken_up_again(slo
         states.append(rider.forecast.outlook.route_state)
         assert (rider.ask() is FREE) == (states[-1] == RouteState.OFF)
     assert states == [RouteState.ON, RouteState.OFF, RouteState.ON]
-
-
-@pytest.mark.parametrize("altitude", ["drifts", "leaps"])
-def test_what_an_altitude_errs_by_is_no_other_road(altitude):
-    """0.1 m/s for 25 minutes, or 40 m now and then."""
-    rider = Rider(way(20e3, grade=lambda x: 0.05 * np.sin(x / 500)))
-    rider.settled()
-    for k in range(1500):
-        rider.ride(1, 1000.0)
-        rider.motion.altitude = (rider.motion.altitude or 0.0) + (
-            0.1 if altitude == "drifts" else 40.0 * (k % 200 == 0)
-        )
-        assert rider.forecast.outlook.route_state == RouteState.ON
-
-
-@given(
-    st.lists(st.tuples(st.floats(0, 1e4), st.floats(0, 200), st.floats(-1e3, 1e3), st.none() | st.floats(-500, 9e3)))
-)
-def test_without_an_altitude_no_heights_are_compared(looks):
-    heights = HeightCheck()
-    for along, ridden, climb, _ in looks:
-        heights.update(along, ridden, climb, None)
-    assert not heights.contradicts
-    for look in looks:
-        heights.update(*look)
-    assert isinstance(heights.contradicts, bool)
 
 
 def test_its_end_is_the_end_of_it():
@@ -346,23 +260,6 @@ def test_reach_is_where_the_energy_is_first_used_up(costs, start, given_):
         assert begin + found == pytest.approx(fine[over[0]], abs=2 * np.max(np.diff(fine)) + 1e-6)
 
 
-@given(
-    soc=st.floats(0.2, 1.0),
-    share=st.floats(0.0, 1.0),
-    temperature=st.floats(-10, 40),
-    power=st.floats(200, 1000),
-    form_factor_squared=st.floats(1.0, 3.0),
-)
-def test_soc_left_is_where_that_share_is_left(soc, share, temperature, power, form_factor_squared):
-    """At the load that it is drawn with: in the cold a fifth of the charge cannot be had."""
-    pack = reference().pack
-    whole = drawable(pack, soc, temperature, power, form_factor_squared)
-    there = soc_left(whole, soc, share)
-    left = drawable(pack, there, temperature, power, form_factor_squared)
-    assert whole.end <= there <= soc + 1e-9
-    assert left.energy == pytest.approx(share * whole.energy, abs=0.02 * whole.energy + 0.002 * whole.slope)
-
-
 def test_the_charge_at_arrival_is_that_which_will_be_shown_there():
     """Of a pack that gives up at 20 % of charge, as in the cold, more than that is shown while energy is left."""
     cold = FREE._replace(left=Drawable(4e6, 8.5e6, 0.2))
@@ -370,11 +267,3 @@ def test_the_charge_at_arrival_is_that_which_will_be_shown_there():
     assert 0 < answer.route_energy < 4e6
     assert answer.arrival_soc == pytest.approx(0.7 - 0.5 * answer.route_energy / 4e6, abs=0.02)
     assert answer.arrival_soc_p10 == 0.0 < 0.2 < answer.arrival_soc < answer.arrival_soc_p90
-
-
-def test_a_long_route_costs_about_as_much_as_its_length():
-    rider = Rider(way(200e3))
-    energy = rider.settled()[1].route_energy
-    assert rider.forecast.costs
-    assert all(b >= a for a, b in pairwise(rider.forecast.costs.level.tolist()))
-    assert energy == pytest.approx(200e3 * 95, rel=0.3)

@@ -112,13 +112,6 @@ def test_it_can_be_joined_anywhere():
     assert seen[-1] == pytest.approx(1900, abs=5)
 
 
-def test_crossing_it_is_not_being_on_it():
-    position = RoutePosition(route([(0, 0), (0, 1000), (1000, 1000), (1000, 0)]))
-    seen = ride(position, [(0, 0), (0, 500), (2000, 500)])
-    assert seen[49] == pytest.approx(500, abs=5)
-    assert seen[70:] == [None] * len(seen[70:])
-
-
 def test_without_fixes_the_distance_counts():
     position = RoutePosition(route(STRAIGHT))
     for _ in range(20):
@@ -132,9 +125,3 @@ def test_a_tunnel_is_bridged():
     for _ in range(100):
         position.update(0.97 * STEP, None, None)
     assert ride(position, [(0, 2000), (0, 3000)])[-1] == pytest.approx(3000, abs=5)
-
-
-def test_positions_along_cross_the_date_line():
-    none = (0.0,) * 2
-    way = Route("way", (0.0, 100.0), none, none, none, none, (0.0, 0.0), (179.9995, -179.9995))
-    assert RoutePosition(way).at(75.0) == pytest.approx((0.0, -179.99975))

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from math import exp
 
 import pytest
 
-from gz_onboard.estimator.battery_priors import Past, uncounted, uncounted_sd
 from gz_onboard.estimator.plausibility.residual import CONFIG, LimitCheck
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import (
-    CELLS,
-    GROUPS,
-    INVERTER,
-    MOTOR,
-    PACK,
-    Scooter,
-    estimator,
-    flat_pack,
-    follow,
-    set_soc,
-    worst,
-)
+from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, follow, set_soc, worst
 from tests.events import ShownSignals
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
@@ -49,36 +35,6 @@ def test_sensors_that_speak_seldom_are_not_accused(period, declared):
     assert {role for _, row in rows for role in row.distrusted} == set()
     assert not rows[-1][1].reasons & (Reason.VOLTAGE_MISMATCH | Reason.CURRENT_MISMATCH)
     assert worst(rows) < 3
-
-
-def test_a_seldom_speed_does_not_make_the_riding_cheaper():
-    """Between two messages it has no acceleration that means anything: a stair of speeds would cost far more."""
-    factors = []
-    for period in (0.1, 3.0):
-        groups = [GROUPS[PACK], Group("Motor", ("motor_speed",), None), *GROUPS[2:]]
-        scooter, e = Scooter(soc=0.9), estimator(groups)
-        last = -10.0
-        for event in scooter.live(1200, 11.0):
-            if event[1] == 1:
-                if event[0] - last < period - 0.01:
-                    continue
-                last = event[0]
-            e.handle(event)
-        factors.append(e.forecaster.learner.factor)
-    assert factors[1] == pytest.approx(factors[0], rel=0.04)
-
-
-def test_what_is_refused_for_coming_too_seldom_is_not_known_either():
-    groups = [Group(group.message, group.roles, None) for group in GROUPS]
-    scooter, e = Scooter(soc=0.8), estimator(groups)
-    follow(e, scooter.live(60), scooter)
-    scooter.period = 8.0
-    rows = follow(e, scooter.live(1200, 11.0), scooter)
-    assert rows[-1][1].state is State.INVALID
-    scooter.period = 0.1
-    back = follow(e, scooter.live(300, 11.0), scooter)
-    assert not back[-1][1].reasons & Reason.SIGNALS_SLOW
-    assert worst(rows + back) < 3
 
 
 @pytest.mark.parametrize(
@@ -128,11 +84,6 @@ def test_a_jump_of_a_settled_signal_is_refused():
 
 def test_a_jump_from_a_start_up_value_is_accepted():
     assert shown(0.0, *[50.0] * 40, 0.0) == [True] * 41 + [False]
-
-
-@pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
-def test_a_pause_is_as_uncertain_as_a_restart(gap):
-    assert uncounted_sd(gap) == uncounted(Past(), gap, Past(0.0), 32.8, 52.0)[1]
 
 
 @pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])
@@ -209,43 +160,6 @@ def test_a_saved_number_that_cannot_be_is_refused(damage):
         estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
 
 
-def numbers(saved, path=()):
-    """The paths of the numbers in a snapshot."""
-    for key, value in saved.items() if isinstance(saved, dict) else enumerate(saved):
-        if isinstance(value, dict | list):
-            yield from numbers(value, (*path, key))
-        elif isinstance(value, int | float):
-            yield (*path, key), value
-
-
-@pytest.mark.parametrize("make", [Scooter, flat_pack])
-@pytest.mark.parametrize("wrong", [lambda x: -10 * x, lambda x: 10 * x, lambda _: 4.0, lambda _: 1e6])
-def test_whatever_was_saved_what_is_published_can_be(make, wrong):
-    """A number that is wrong is refused, or what is made of it has an interval that can be."""
-    scooter = make(soc=0.6)
-    e = estimator(vehicle=scooter.vehicle)
-    follow(e, scooter.live(30), scooter)
-    follow(e, scooter.live(300, 10.0), scooter)
-    saved = json.loads(json.dumps(e.snapshot("key")))
-    events = [*scooter.live(4), *scooter.live(2, 8.0)]
-    taken = 0
-    for path, value in numbers(saved):
-        changed, part = (whole := json.loads(json.dumps(saved))), path[-1]
-        for key in path[:-1]:
-            changed = changed[key]
-        changed[part] = wrong(value)
-        fresh = estimator(vehicle=scooter.vehicle)
-        try:
-            fresh.restore(whole, "key", 3600.0)
-        except ValueError:
-            continue
-        taken += 1
-        for _, row in follow(fresh, events, scooter):
-            assert row.soc_sd is None or row.soc_sd <= 0.3, path
-            assert not row.range or row.range_p10 < row.range <= row.range_p90 < 1e6, (path, row)
-    assert taken > 30
-
-
 @pytest.mark.parametrize(("seconds", "charge"), [(3600, 15.0), (7200, 8.0), (600, 15.0), (3600, 0.0)])
 @pytest.mark.parametrize("soc", [0.15, 0.3])
 def test_charged_or_parked_while_the_bus_was_silent(soc, seconds, charge):
@@ -296,21 +210,6 @@ def test_a_loose_connector_makes_the_state_of_charge_unsure_and_not_wrong(on, of
     assert {role for _, row in rows for role in row.distrusted} == set()
 
 
-@pytest.mark.parametrize("period", [4.0, 5.0, 8.0])
-def test_a_held_voltage_proves_no_rest(period):
-    """Only the pack's message is slow."""
-    groups = [Group(GROUPS[PACK].message, GROUPS[PACK].roles, None), *GROUPS[1:]]
-    scooter, e, rows, last = Scooter(soc=0.7), estimator(groups), [], 0.0
-    for event in scooter.live(600, 11.0):
-        if event[1] == PACK and event[0] > 60:
-            if event[0] - last < period - 0.01:
-                continue
-            last = event[0]
-        e.handle(event)
-        rows.append((scooter.soc, e.estimate(event[0])))
-    assert worst(rows) < 3
-
-
 @pytest.mark.parametrize("begin", [0.0, 15.0, 40.0])
 @pytest.mark.parametrize("time_constant", [0.5, 3.0])
 def test_a_precharge_accuses_nobody(begin, time_constant):
@@ -336,16 +235,3 @@ def test_a_start_on_a_voltage_that_lies_is_made_again(volts):
     rows = follow(e, spoilt, scooter)
     assert worst(rows[20:]) < 3
     assert "pack_voltage" in rows[-1][1].distrusted
-
-
-def test_cells_do_not_cool_like_that():
-    scooter, e = Scooter(soc=0.6), estimator(MORE)
-    follow(e, beside(scooter.live(60, 10.0)), scooter)
-    named: dict[str, int] = {}
-    for step in range(300):
-        for event in beside(scooter.live(1.0, 10.0), cells=28.0 - 0.05 * step):
-            e.handle(event)
-        for role in e.estimate(scooter.time).distrusted:
-            named.setdefault(role, step)
-    assert list(named) == ["cell_temperature"]
-    assert named["cell_temperature"] < 240

@@ -35,22 +35,6 @@ def test_mountains_are_learned_within_some_stretches():
     assert found.rate > 30 * RATE
 
 
-def test_hills_that_give_back_what_they_took_do_not_count():
-    terrain = Terrain()
-    for i in range(64):
-        terrain = terrain.ridden(SEGMENT, 12.0 * (-1) ** i, 0.0)
-    assert terrain.rate < RATE
-
-
-def test_another_country_is_learned_after_the_first():
-    there = ridden([100.0] * 60)
-    assert ridden([2.0] * 150, there).rate < there.rate / 10
-
-
-def test_a_stretch_whose_grade_was_not_seen_tells_nothing():
-    assert ridden([0.0] * 10, unseen=0.5) == Terrain()
-
-
 def test_no_road_is_as_steep_as_a_faulty_sensor_says():
     assert ridden([3000.0]) == Terrain()
 

@@ -13,20 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW, Group, RoleWindow
 from gz_onboard.model.effect import load_effect
 from gz_onboard.offline.sensors import Vibration
-from gz_onboard.simulation.frames import batches, simulate_frames
-from gz_onboard.simulation.run import along, drive
-from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
 from tests.events import EventEstimator
-from tests.support import joined, ridden, without_cell_effects
+from tests.support import joined, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
 ROUGH = """\"\"\"Drag of a rough road, in proportion to the vibration, made up for a test.\"\"\"
@@ -88,11 +83,6 @@ def test_it_is_what_the_lab_makes_of_the_same_samples():
     assert lab.value == pytest.approx(1.7, rel=0.15)
 
 
-def test_slow_motion_is_no_vibration():
-    hills = [(0.01 * i, 9.81 + 2.0 * math.sin(0.01 * i)) for i in range(2000)]
-    assert fed(hills).value(19.99) < 0.3
-
-
 @pytest.mark.parametrize(
     ("samples", "known"),
     [
@@ -113,15 +103,6 @@ def test_known_or_not(samples, known):
     monitor = fed(samples)
     assert (monitor.value(now) is not None) == known
     assert monitor.value(now + 1.2) is None
-
-
-def test_after_a_stuck_sensor_it_begins_anew():
-    stuck = shaken(20, 3.0) + [(20 + 0.01 * i, 11.0) for i in range(200)]
-    monitor = fed(stuck)
-    assert monitor.value(stuck[-1][0]) is None
-    again = shaken(60, 1.0, begin=22.0)
-    assert fed(again[:300], monitor).value(again[299][0]) is None
-    assert fed(again[300:], monitor).value(again[-1][0]) == pytest.approx(1.0, rel=0.2)
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(-60, 60)), max_size=60), st.floats(0, 0.2))
@@ -189,37 +170,6 @@ def test_missing_or_implausible_it_is_the_typical(rough, quiet):
     assert max(found) < 1.001 * min(found)
 
 
-def test_lost_midway_it_goes_over_to_the_typical_and_back(rough):
-    e, seen = estimated(rough, []), {}
-    for event in events(120, 2.5, lambda t: 50 < t < 70):
-        e.handle(event)
-        seen[round(event[0])] = e.load.vibration(event[0])
-    assert seen[49] == pytest.approx(2.5, rel=0.2)
-    assert seen[60] in (TYPICAL, 0.0)
-    assert seen[74] in (TYPICAL, 0.0)
-    assert seen[90] == pytest.approx(2.5, rel=0.2)
-
-
-def test_a_model_that_does_not_read_it_does_not_look(quiet):
-    with_samples, without = (
-        estimated(BASE, rows) for rows in (events(60, 2.0), [row for row in events(60, 2.0) if row[1] != AT])
-    )
-    assert with_samples._vibration is None
-    one, other = with_samples.estimate(60.0), without.estimate(60.0)
-    assert one.soc == pytest.approx(other.soc, abs=1e-4)
-    assert one.range == pytest.approx(other.range, rel=1e-3)
-
-
-def test_before_anything_is_ridden_the_prior_counts(rough):
-    consumption = []
-    for vibration in (0.0, TYPICAL):
-        riding = BASE.riding.__class__(vibration=vibration)
-        f = Forecaster(rough.model, rough.pack, riding)
-        consumption.append(f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0).consumption)
-    more = riding.factor * riding.unevenness * NEWTONS * TYPICAL
-    assert more * 0.95 < consumption[1] - consumption[0] < more * 1.2
-
-
 def test_what_was_learned_outlives_a_restart(rough):
     first = estimated(rough, events(240, 2.5))
     saved = json.loads(json.dumps(first.snapshot(rough.key)))
@@ -238,27 +188,4 @@ def test_what_was_learned_outlives_a_restart(rough):
         estimated(BASE, []).restore(saved, BASE.key, 5.0)
 
 
-def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
-    """In the cells too it is what is felt, and the typical for the energy left."""
-    loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
-    for vibration in (0.01, 2.5):
-        e = estimated(loose, events(60, vibration))
-        assert e.pack.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
-    settled = e.forecaster.load.overpotential(e.pack.battery)
-    assert settled is not None
-    assert settled(1.0, 0.5, 20.0, 2.0) == pytest.approx(0.01 * TYPICAL)
-
-
 # --- from frames --------------------------------------------------------------------------------------------------
-
-
-def test_simulated_frames_tell_it(rough):
-    scooter = Scooter(rough, soc=0.8, vibration=lambda distance: 0.6 if distance < 600 else 2.2)
-    trace = Trace()
-    drive(scooter, trace.watch(along([8.0] * 2000)), 140.0)
-    frames = [frame for batch in batches(simulate_frames(rough, trace.truth(scooter), 3)) for frame in batch]
-    whole, base = ridden(frames, rough), ridden(frames, BASE)
-    assert whole.pipeline.estimator.load.vibration(whole.estimates[-1].time) == pytest.approx(2.2, rel=0.2)
-    now, without = (run.pipeline.estimator.forecaster.learner.state.recent for run in (whole, base))
-    assert now.measured / now.modelled == pytest.approx(1.0, abs=0.1)
-    assert without.measured / without.modelled > 1.1

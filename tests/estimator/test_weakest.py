@@ -16,12 +16,12 @@ import pytest
 from gz_onboard.can.codec import Codec
 from gz_onboard.estimator import forecast
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.weakest import CHARGE, CONFIG, NAMES, VoltageBlock, WeakestGroup
+from gz_onboard.estimator.weakest import CONFIG, NAMES
 from gz_onboard.events import Cause, Group
 from gz_onboard.model.battery import Battery, Health, WeakGroup
 from gz_onboard.model.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
-from tests.events import Event, EventEstimator, ShownSignals, events_of
+from tests.events import Event, EventEstimator, events_of
 from tests.plant.machine import SERIES
 from tests.plant.packs import STEP, Discharge, discharge
 from tests.plant.ride import Hidden
@@ -152,26 +152,6 @@ def test_a_healthy_pack_has_none():
         assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
 
 
-def test_without_the_signal_nothing_is_known():
-    estimator: Any = EventEstimator(
-        [*BUS[:3], Group("Cells", BUS[3].roles[:2], 1.0)], VEHICLE.pack, VEHICLE.model, VEHICLE.riding
-    )
-    for time, group, values in heard(WEAK):
-        if time > 600:
-            break
-        estimator.handle((time, group, values[:2]))
-    assert estimator.pack.battery.health.weakest is None
-    assert estimator.snapshot("key")["learned"]["weakest"]["blocks"] == 0
-
-
-def test_the_state_of_charge_stays_the_mean_cell_s():
-    found, pack = at(WEAK, 0.2), packs()[WEAK]
-    end = found.estimate(found._time)
-    assert end.soc == pytest.approx(0.2, abs=0.02)
-    assert end.range < 0.65 * left(found, None) / end.consumption_expected
-    assert pack.soc[-1] > 0.1
-
-
 def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
     found = at(WEAK, 0.2)
     explainer, believed, ends = found.explainer, found.pack.battery, []
@@ -190,46 +170,6 @@ def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
         if cause:
             more = with_it.causes[cause] - without.causes[cause]
             assert abs(more + (shorter if cause is Cause.AGE else 0.0)) < 0.25 * shorter, cause
-
-
-def fed(battery: Battery, missing: float, soc: tuple[float, float]) -> WeakestGroup:
-    """What is learned of a group of which so much is `missing`, between two states of charge of the mean cell."""
-    weakest = WeakestGroup(battery, ShownSignals("lowest_cell_voltage", stale=10.0), VEHICLE.parameters)
-    for z in np.arange(soc[0], soc[1], -CONFIG.block):
-        block = VoltageBlock(z)
-        for k in range(CONFIG.min_samples):
-            mean = battery.ocv(z)[0] - 0.02 * k
-            block.add(mean + battery.ocv(z - missing)[0] - battery.ocv(z)[0], mean, 0.02 * k)
-        weakest.take(block, z)
-    return weakest
-
-
-def test_a_flat_curve_shows_a_low_group_only_at_its_end():
-    flat = tuple(3.2 + 0.03 * z + (0.2 * (z - 0.1) / 0.1 if z < 0.1 else 0.0) for z in VEHICLE.pack.ocv_curve.x)
-    battery = replace(VEHICLE.pack, ocv_curve=replace(VEHICLE.pack.ocv_curve, y=flat))
-    weakest = fed(battery, 0.04, (0.9, 0.3))
-    plateau = weakest.learned()["weak_charge"]
-    assert plateau.sd > 0.9 * CONFIG.prior_sd[CHARGE]
-    assert abs(plateau.value - 1) < 0.01
-    assert weakest.group
-    assert weakest.group.charge < 0.002
-    end = fed(battery, 0.04, (0.12, 0.08))
-    assert end.known.behind(0.9)[0] == pytest.approx(0.04, abs=0.012)
-
-
-def test_a_charge_or_a_new_state_of_charge_begins_another_block():
-    estimator: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
-    blocks: list[tuple[VoltageBlock, float]] = []
-    estimator.pack.weakest.take = lambda block, soc: blocks.append((block, soc))
-    charged = False
-    for event in heard(WEAK):
-        if len(blocks) == 3 and estimator.pack.weakest._block.count > 3 and not charged:
-            charged, estimator.pack.state = True, estimator.pack.state._replace(soc=estimator.pack.state.soc + 0.2)
-        estimator.handle(event)
-        if len(blocks) == 6:
-            break
-    assert any(block.began > START + 0.05 for block, _ in blocks)
-    assert all(0 < block.began - soc < CONFIG.place for block, soc in blocks)
 
 
 # --- signals that lie -----------------------------------------------------------------------------------------------
@@ -257,23 +197,6 @@ def test_a_lie_from_the_start_teaches_nothing(name: str):
     assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.005)
 
 
-def charged(saved: dict[str, Any]) -> None:
-    """Charge the pack of a saved state to `START`."""
-    saved |= {"soc": START, "soc_variance": 1e-4, "error_variance": 1e-4}
-    saved["learned"]["capacity_with_soc"] = 0.0
-
-
-@pytest.mark.parametrize("name", LIES)
-def test_a_lie_changes_nothing_that_was_learned(name: str):
-    before = at(WEAK, 0.2)
-    saved, known = before.snapshot("key"), before.pack.weakest.learned()
-    charged(saved)
-    found = ridden(WEAK, 0.57, LIES[name](), saved)
-    for x, learned in found.pack.weakest.learned().items():
-        assert abs(learned.value - known[x].value) < 1.5 * known[x].sd
-    assert found.pack.battery.health.weakest.capacity > 0.05
-
-
 def test_a_group_that_would_long_be_empty_is_none():
     """A signal 0.15 V too low from the start looks like a weak group, until the pack goes on without it."""
     deceived, later = (ridden(Hidden(), until, lambda t, v: v - 0.15) for until in (0.3, 0.12))
@@ -282,13 +205,6 @@ def test_a_group_that_would_long_be_empty_is_none():
     assert later.pack.weakest.refused
     assert later.pack.weakest.group is None
     assert left(later, later.pack.battery.health.weakest) == pytest.approx(left(later, None))
-
-
-def test_a_signal_that_tells_the_truth_again_is_believed_again():
-    lie = LIES["high"]()
-    found = ridden(WEAK, 0.45, lambda t, v: lie(t, v) if t < 200 else v)
-    assert not found.pack.weakest.refused
-    assert found.pack.weakest.learned()["weak_capacity"].value < 0.98
 
 
 # --- kept -----------------------------------------------------------------------------------------------------------
@@ -354,14 +270,3 @@ def test_a_pack_delivers_until_its_weakest_group_ends():
     assert 0 < whole.energy - harder.energy < 0.02 * whole.slope
     alike = drawable(pack_with(WeakGroup(0.0, 0.0, 0.0)), 0.5, 18.0, 700.0)
     assert alike.energy == pytest.approx(whole.energy, rel=2e-3)
-
-
-def test_another_pack_begins_with_no_weak_group():
-    """Of packs that are told apart by their resistance."""
-    saved = at(WEAK, 0.2).snapshot("key")
-    saved["learned"]["resistance"] = 1.6
-    charged(saved)
-    found = ridden(Hidden(), 0.55, saved=saved)
-    assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
-    for x in found.pack.weakest.learned().values():
-        assert abs(x.value - 1) < 2 * x.sd

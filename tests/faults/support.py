@@ -16,7 +16,6 @@ from tests.support import Run, S, changed, check_sound, identifier, not_availabl
 BEGIN, END = 40.0, 80.0  # s: when things go wrong
 RIDE = 110.0  # s
 USUAL = Reason.PRIOR_RIDING | Reason.FRAMES_LOST  # of this ride as it was recorded, some counters of which jump
-PASSING = Reason.FRAMES_DROPPED | Reason.FRAMES_LOST
 
 Spoil = Callable[[Frame], Frame | None]
 

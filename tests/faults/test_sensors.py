@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import count
 from math import log, sqrt
 
 import pytest
@@ -116,31 +115,6 @@ def test_another_speed_stands_in_for_the_motors(spoil: Spoil, tolerance: float):
     assert run.at(RIDE).distance == pytest.approx(unspoilt().at(RIDE).distance, rel=0.01)
 
 
-def test_a_gps_at_1_hz_beside_the_motor_has_no_sound_sensor_left_out():
-    """The only two speeds that there are; at 5 Hz, as recorded, they contradict nothing either."""
-    fixes = count()
-    seldom = of("GPS_Motion", lambda frame: None if next(fixes) % 5 else frame)
-    run = ridden(spoilt(both(without("HBM_Wheels"), seldom), 0.0, RIDE))
-    assert not any(e.distrusted for e in run.between(0.0, RIDE))
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_a_sensor_that_was_never_there(name: str):
-    spoil, reason, _, _, _, _ = LOSSES[name]
-    run = ridden(spoilt(spoil, -1.0, RIDE + 1))
-    check_sound(run)
-    late = run.between(12.0, RIDE)
-    assert all(e.reasons & reason == reason for e in late)
-    if name == "voltages":  # no voltage, no state of charge: nothing is published
-        assert {e.state for e in late} == {State.INVALID}
-        assert all(e.soc is None and e.range is None for e in late)
-        return
-    assert {e.state for e in late} == {State.DEGRADED}
-    end, true = numbers(run.at(RIDE)), numbers(unspoilt().at(RIDE))
-    assert abs(end[0] - true[0]) < 3 * end[1]
-    assert end[3] < true[2] < end[4]
-
-
 def test_stale_after_ten_periods_and_not_before():
     last = max(f[0] for f in ride() if f[1] == identifier("BMS_Cells") and f[0] < ride()[0][0] + BEGIN * S)
     since = (last - ride()[0][0]) / S
@@ -173,16 +147,6 @@ def test_a_sensor_that_lies_is_named_and_the_interval_holds_the_truth(name: str)
     assert p10 < true_range < p90
     assert abs(soc - true_soc) < sd
     assert log(p90 / p10) > 1.05 * log(true_p90 / true_p10), "the range is said to be as certain as before"
-
-
-@pytest.mark.parametrize("lie", [lambda t, v: -300.0, lambda t, v: 2 * v, lambda t, v: v + 5.0])
-def test_what_a_named_current_sensor_says_no_longer_widens(lie: Lie):
-    """The other one is believed: no less certain than by one current sensor only."""
-    last = whole_ride((("pack_current",), "named", lambda: lie))[-1]
-    lost = whole_ride((("pack_current",), "lost", lambda: lambda t, v: None))[-1]
-    assert set(last.distrusted) == {"pack_current"}
-    assert last.soc_sd is not None and lost.soc_sd is not None
-    assert last.soc_sd == pytest.approx(lost.soc_sd, rel=0.1)
 
 
 def test_a_sensor_that_lies_goes_onto_the_bus_by_name():

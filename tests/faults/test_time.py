@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import pytest
 
 from gz_onboard.can.codec import TIME
@@ -21,7 +19,7 @@ from tests.faults.support import (
     spoilt,
     unspoilt,
 )
-from tests.support import MS, Run, S, check_frames, check_sound, reasons_in, received, ridden
+from tests.support import Run, S, check_frames, check_sound, reasons_in, received, ridden
 
 
 def restamped(index: int, offset_s: float) -> list[Frame]:
@@ -29,36 +27,6 @@ def restamped(index: int, offset_s: float) -> list[Frame]:
     frames = list(ride())
     frames[index] = (frames[index][0] + round(offset_s * S), *frames[index][1:])
     return frames
-
-
-ODD = [(live, offset) for live in (False, True) for offset in (-1e9, -3600.0, -10.0, -0.2, 31.0, 3600.0, 1e9)]
-
-
-@pytest.mark.parametrize(("live", "offset"), [*ODD, (False, 2.0), (False, 9.0), (False, 29.0)])
-def test_one_odd_time_stamp_is_dropped(live: bool, offset: float):
-    frames = restamped(30_000, offset)
-    if live:
-        run = received((right[0], frame) for right, frame in zip(ride(), frames, strict=True))
-    else:
-        run = ridden(frames)
-    check_all(run)
-    assert run.faults == {("", TIME): 1}
-    assert reasons_in(run.estimates) & Reason.FRAMES_DROPPED
-    assert len(run.estimates) == pytest.approx(len(unspoilt().estimates), abs=10)
-
-
-@pytest.mark.parametrize("offset", [2.0, 29.0])
-def test_one_time_stamp_a_little_ahead_does_no_harm(offset: float):
-    """Live it cannot be told from a gap before its successors have come, so that much of the timeline is skipped."""
-    frames = restamped(30_000, offset)
-    run = received((right[0], frame) for right, frame in zip(ride(), frames, strict=True))
-    check_sound(run)
-    check_timeline(run)
-    check_no_jump(run, soc=0.008)  # as much as a gap of that length leaves unknown
-    assert 1 <= sum(n for (_, reason), n in run.faults.items() if reason == TIME) <= 3
-    end, true = numbers(run.at(RIDE + offset)), numbers(unspoilt().at(RIDE))
-    assert abs(end[0] - true[0]) < min(end[1], 0.01)
-    assert abs(end[2] / true[2] - 1) < 0.03
 
 
 @pytest.mark.parametrize("step", [-86400.0, -3600.0, -30.0, -1.0])
@@ -113,16 +81,6 @@ def test_the_clock_is_set_under_the_daemon(step: float):
     assert stamps[-1] - first == pytest.approx((RIDE + step) * S, abs=0.3 * S)  # on the new clock
 
 
-def test_frames_of_two_channels_overtake_each_other():
-    rng = random.Random(5)
-    late = sorted(ride(), key=lambda frame: frame[0] + rng.randrange(20 * MS))
-    run = ridden(late)
-    check_sound(run)
-    check_timeline(run)
-    assert ("", TIME) not in run.faults
-    assert abs(numbers(run.at(RIDE))[0] - numbers(unspoilt().at(RIDE))[0]) < 0.002
-
-
 @pytest.mark.parametrize("seconds", [0.5, 3.0, 20.0])
 @pytest.mark.parametrize("live", [False, True])
 def test_a_gap(seconds: float, live: bool):
@@ -150,14 +108,3 @@ def test_a_gap(seconds: float, live: bool):
     if seconds == 20.0:
         assert end[1] > 0.97 * true[1]  # no surer, but for where each stopped at what hysteresis allows
     assert run.at(RIDE).state is State.VALID
-
-
-def test_a_bus_that_is_silent_from_the_start():
-    run = Run()
-    for t in range(0, 30_000, 50):
-        run.pipeline.advance((), ride()[0][0] + t * MS)
-    check_sound(run)
-    assert all(e.state in (State.STARTING, State.INVALID) for e in run.estimates)
-    assert len(run.estimates) == pytest.approx(60, abs=2)
-    decoded = check_frames(run.sent)
-    assert all(row["RANGE_Remaining"] > 655.34 for row in decoded["RANGE_Estimate"])

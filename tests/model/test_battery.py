@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from gz_onboard.calibration.cooling_run import dissipation
 from gz_onboard.model.battery import current_of
 from gz_onboard.model.drawable import DISCHARGE, drawable
-from gz_onboard.model.effect import Port, load_effect
-from gz_onboard.model.functions import Mesh, PiecewiseLinear
-from gz_onboard.model.model import Model
-from gz_onboard.offline.series import advanced, first_soc, heat, reversible_heat_over, soc_at_load, terminal_voltage
+from gz_onboard.model.functions import Mesh
+from gz_onboard.offline.series import advanced, heat, terminal_voltage
 from gz_onboard.vehicle import read_vehicle
-from tests.support import cell_voltage
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
@@ -33,30 +30,9 @@ def test_mesh_equals_numpy_interpolation(soc, temperature):
     assert mesh.at(soc, temperature)[0] == pytest.approx(np.interp(soc, mesh.soc, row), rel=1e-9)
 
 
-@given(st.floats(0.001, 0.999), st.floats(-20, 50))
-def test_slopes_are_the_differences(soc, temperature):
-    h = 1e-7
-    for value, slope in ((BATTERY.ocv, None), (lambda s: BATTERY.r0.at(s, temperature), None)):
-        del slope
-        if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_curve.x, *BATTERY.r0.soc)):
-            return
-        difference = (value(soc + h)[0] - value(soc - h)[0]) / (2 * h)
-        assert value(soc)[1] == pytest.approx(difference, rel=1e-3, abs=1e-5)
-
-
 @given(st.floats(-0.05, 1.05))
 def test_soc_at_inverts_ocv(soc):
     assert BATTERY.soc_at(BATTERY.ocv(soc)[0]) == pytest.approx(soc, abs=1e-9)
-
-
-@given(st.floats(0.1, 0.95), st.floats(-1, 4), st.floats(0, 40), st.floats(-0.02, 0.05))
-def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
-    voltage = cell_voltage(BATTERY, soc, v1, current, temperature)
-    assert soc_at_load(BATTERY, voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
-    voltage = cell_voltage(BATTERY, soc, 0.0, current, temperature)
-    amperes = BATTERY.cells_parallel * current
-    first = first_soc([], BATTERY, (BATTERY.pack_voltage(voltage, amperes), amperes), temperature, 0.0)
-    assert first == pytest.approx(soc_at_load(BATTERY, voltage, current, temperature), abs=1e-9)
 
 
 def test_what_the_resistors_take_and_the_chemistry_gives_is_the_same_over_a_ride():
@@ -79,11 +55,6 @@ def test_a_cell_advances_by_charge_and_rc_pair(soc, v1, current, temperature, dt
     r1, c1 = BATTERY.r1.at(soc, temperature)[0], BATTERY.c1.at(soc, temperature)[0]
     assert later == pytest.approx(soc - current * dt / 3600 / BATTERY.cell_capacity(temperature))
     assert after == pytest.approx(r1 * current + (v1 - r1 * current) * math.exp(-dt / (r1 * c1)))
-
-
-def test_a_mesh_of_one_temperature():
-    mesh = Mesh((0.0, 1.0), (25.0,), ((1.0, 3.0),))
-    assert mesh.at(0.25, -40) == (1.5, 2.0)
 
 
 @given(power=st.floats(-5000, 20_000), source=st.floats(20, 100), resistance=st.floats(0.005, 0.5))
@@ -147,42 +118,6 @@ def test_bursts_cost_energy_as_a_step_by_step_discharge_says():
     assert abs(bursts.energy - real) < 0.3 * abs(steady.energy - real)
 
 
-@pytest.mark.parametrize("temperature", [-10.0, 25.0])
-@pytest.mark.parametrize("form_factor_squared", [1.5, 3.0])
-def test_bursts_cost_the_reaction_what_a_step_by_step_discharge_says(temperature, form_factor_squared):
-    """Currents drawn at random, 10 s each, through a reaction that bends and lags: as the charge meets it."""
-    model = Model((load_effect("charge_transfer"),), VEHICLE.parameters)
-    settled = model.overpotential(BATTERY)
-    (reaction,) = model.at(Port.CELL_VOLTAGE)
-    shape = 1 / (form_factor_squared - 1)
-    currents = np.random.default_rng(0).gamma(shape, 1.5 / shape, 4000)  # A of a cell
-    real, lost, step = 0.0, 0.0, 0.1
-    for current in currents:
-        q = {"cell_current": float(current), "cell_temperature": temperature}
-        target, left = reaction(q), reaction.decay(step, q)
-        for _ in range(100):
-            lost = left * lost + (1 - left) * target
-            real += lost * current / 100
-    mean, square = currents.mean(), (currents**2).mean()
-    assert settled is not None
-    expected = settled(mean, 0.5, temperature, square / mean**2)
-    assert expected == pytest.approx(real / currents.sum(), rel=0.06)
-    assert settled(mean, 0.5, temperature, 1.0) < 0.95 * expected
-
-
-@given(st.floats(0.05, 1.0), st.floats(-10, 45), st.floats(50, 2500))
-def test_drawable_is_sane(soc, temperature, power):
-    now = drawable(BATTERY, soc, temperature, power)
-    assert math.isfinite(now.energy)
-    assert now.energy >= 0
-    assert drawable(BATTERY, soc - 0.02, temperature, power).energy <= now.energy + 1e-6
-    assert drawable(BATTERY, soc, temperature, 1.5 * power).energy <= now.energy * (1 + 1e-9)
-    full = BATTERY.pack_capacity(temperature) * 3600 * BATTERY.cells_series * BATTERY.ocv(soc)[0]
-    assert now.energy < full * (soc + 0.06)
-    assert now.end_drop_sd == 0  # of a steady load
-    assert now.by_cutoff >= 0
-
-
 @given(st.floats(10, 45), st.floats(300, 1200), st.floats(1.2, 3.0))
 def test_bursts_end_it_before_the_mean_load_would(temperature, power, form_factor_squared):
     """At a load that is above its mean by `give_up_load` of its sd, which is known to `give_up_load_sd` of that."""
@@ -219,14 +154,6 @@ def test_a_higher_cutoff_takes_what_it_is_said_to(temperature, power, form_facto
     assert 0.9 * taken < found.by_cutoff < 1.55 * taken
 
 
-def test_how_much_the_cutoff_counts_does_not_step_at_a_knot_of_the_table():
-    """Loads whose ends pass the knots near empty: from one to the next, 0.5 % apart, it changes by a few per cent."""
-    powers = 300 * 1.005 ** np.arange(300)
-    by_cutoff = np.array([drawable(BATTERY, 0.6, 23.0, power, 2.4).by_cutoff for power in powers])
-    assert np.ptp(by_cutoff) > 0.2 * by_cutoff.mean()  # they do pass some
-    assert np.abs(np.diff(np.log(by_cutoff))).max() < 0.04
-
-
 @given(st.floats(0.3, 3.0), st.floats(0.02, 1.0), st.floats(-10, 45))
 def test_the_resistance_factor_is_on_both_resistances_and_leaves_the_time_constant(factor, soc, temperature):
     more = BATTERY.with_parameters(PARAMETERS.replaced(cell_resistance_factor=factor))
@@ -249,13 +176,3 @@ def test_a_resistance_beside_equals_one_inside(soc):
     beside = drawable(flat, soc, 20.0, 800.0, 2.0, lambda current, soc, temperature, form: r * current)
     assert beside.energy == pytest.approx(drawable(inside, soc, 20.0, 800.0, 2.0).energy, rel=1e-3)
     assert beside.energy < drawable(flat, soc, 20.0, 800.0, 2.0).energy
-
-
-def test_heat_of_the_reaction_turns_with_the_current_and_with_the_entropy():
-    battery = replace(BATTERY, entropy=PiecewiseLinear((0.2, 0.8), (-4e-4, 2e-4)))
-    assert battery.reversible_heat(10.0, 0.0, 25.0) == pytest.approx(battery.cells_series * 4e-4 * 10 * 298.15)
-    assert battery.reversible_heat(-10.0, 0.6, 25.0) == pytest.approx(0.0, abs=1e-9)
-    many = reversible_heat_over(battery, np.array([10.0, -10.0]), np.array([0.9, 0.9]), np.array([0.0, 0.0]))
-    assert many == pytest.approx([-2e-3 * battery.cells_series * 273.15, 2e-3 * battery.cells_series * 273.15])
-    none = replace(battery, entropy=None)
-    assert none.reversible_heat(10.0, 0.5, 25.0) == 0

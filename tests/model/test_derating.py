@@ -90,13 +90,6 @@ def test_what_makes_no_sense_is_refused_by_line_and_key(tmp_path, old, new, word
         assert word in message
 
 
-@pytest.mark.parametrize("name", [entry.name for entry in fields(Derating)])
-def test_the_reference_and_the_docs_have_it(name):
-    assert f"\n{name} = {{" in CONTROLLER
-    text = (OWN.parents[1] / "docs" / "reference" / "vehicle-file.md").read_text(encoding="utf-8")
-    assert f"`controller.{name}`" in text
-
-
 def test_the_scooter_is_held_back_by_its_files_tables(tmp_path):
     from gz_onboard.simulation.scooter import Scooter
 

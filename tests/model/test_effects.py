@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.model.effect import QUANTITIES, Port, effects_in, load_effect, package_effects
 from gz_onboard.model.model import Bound, stepping
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.series import over, series
+from gz_onboard.offline.series import over
 from gz_onboard.offline.traits import traits
 
 EFFECTS = [load_effect(name) for name in package_effects()]
@@ -154,13 +153,6 @@ class TestMemory:
         assert taken >= -0.01 * turned - 1e-12
 
 
-def test_an_effect_with_memory_starts_at_nothing():
-    e = bound(load_effect("slow_relaxation"))
-    q = {"cell_current": 5.0}
-    assert e.step(0.0, 0.0, q) == 0
-    assert series(e, 0.1, q).shape == (1,)
-
-
 def test_headwind_is_the_difference_of_the_drag_and_goes_round_with_the_heading():
     wind, drag = (load_effect(name).term.function for name in ("headwind", "aerodynamic_drag"))
     blow = {"drag_area": 0.5, "wind_north": 3.0, "wind_east": 0.0}
@@ -199,20 +191,6 @@ def test_a_folder_of_effects(tmp_path):
     assert effects_in(tmp_path) == ("one",)
     with pytest.raises(InputError, match="no such folder"):
         effects_in(tmp_path / "none")
-
-
-def test_a_user_effect_is_one_file(tmp_path: Path):
-    (tmp_path / "cornering_test.py").write_text(
-        '"""A force that grows with speed, for a test of loading."""\n'
-        "from gz_onboard.model.effect import Parameter, Port\n"
-        "PORT = Port.WHEEL_FORCE\n"
-        'PARAMETERS = (Parameter("test_force", "N·s/m", 1.0, 1.0, 0.0, 9.0, "made up for a test"),)\n'
-        "def term(speed, *, test_force):\n"
-        "    return test_force * speed\n"
-    )
-    effect = load_effect("cornering_test", tmp_path)
-    assert effect.term.function(3.0, test_force=2.0) == 6.0
-    assert effect.term.quantities == ("speed",)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.model.effect import QUANTITIES
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.series import all_quantities
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -74,12 +72,6 @@ def test_arrays_equal_scalars(rows):
             assert np.broadcast_to(together[name], len(rows))[i] == pytest.approx(value, rel=1e-9, abs=1e-9)
 
 
-@given(ridings)
-def test_friction_brakes_only_take(q):
-    ledger = MODEL.power(complete(q))
-    assert ledger["brakes"] >= -1e-9
-
-
 def test_out_and_back_over_a_hill_costs_but_never_gives():
     """Kinetic and potential energy are given back at best: a round trip has a positive sum."""
     total = 0.0
@@ -127,11 +119,3 @@ def test_a_motor_without_current_takes_nothing_from_the_pack_and_slows_the_scoot
     assert rolling["motor_copper_loss"] == pytest.approx(0, abs=1e-4)
     idle = P["inverter_loss_constant"] + P["auxiliary_power"]
     assert sum(rolling.values()) == pytest.approx(idle, abs=0.05)
-
-
-def test_all_quantities_are_there_and_the_cosine_goes_with_the_grade():
-    q = all_quantities(speed=3.0, grade=0.6)
-    assert set(q) == set(QUANTITIES)
-    assert (q["speed"], q["grade_cosine"], q["mass"]) == (3.0, pytest.approx(0.8), 0.0)
-    assert all_quantities()["grade_cosine"] == 1.0
-    assert all_quantities(grade=np.array([0.0, 0.6]))["grade_cosine"] == pytest.approx([1.0, 0.8])

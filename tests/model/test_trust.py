@@ -32,21 +32,6 @@ def test_what_others_can_write_is_not(file: Path, depth: int, mode: int):
     assert changeable(file, ME) == f"{place} can be written by others (chmod go-w)"
 
 
-def test_what_a_group_can_write_is_not_but_for_the_users_own(file: Path, monkeypatch: pytest.MonkeyPatch):
-    file.chmod(0o664)
-    os.chown(file, -1, os.getgid())
-    for own in (True, False):
-        monkeypatch.setattr("gz_onboard.model.effect._is_private_group", lambda *_, own=own: own)
-        assert (changeable(file, ME) is None) == own
-
-
-def test_in_a_sticky_folder_each_has_but_his_own(file: Path):
-    file.parent.chmod(0o1777)
-    assert changeable(file, ME) is None
-    file.parent.chmod(0o777)
-    assert changeable(file, ME)
-
-
 def test_what_belongs_to_another_is_not(file: Path):
     assert "belongs to " in str(changeable(file, ME - {file.stat().st_uid} | {123456}))
 

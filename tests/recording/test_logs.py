@@ -1,13 +1,10 @@
 from __future__ import annotations
 
-import argparse
 import contextlib
-import gzip
 import os
 import struct
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,12 +14,9 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.can.dbc import find_dbc
 from gz_onboard.can.logfile import LogFile
 from gz_onboard.errors import InputError
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
-from gz_onboard.lab import export
-from gz_onboard.recording import logs
+from gz_onboard.events import EFF_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.logs import json_channels, read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.readers.python_can import frame_of
@@ -125,12 +119,6 @@ def test_text_formats_are_read_as_by_python_can(suffix: str, sent: list[can.Mess
     check_against_python_can(suffix, sent, 0)
 
 
-def test_the_channels_of_a_candump_are_numbered_by_their_names(tmp_path: Path) -> None:
-    path = tmp_path / "a.log"
-    path.write_text("".join(f"(1.000000) {name} 123#\n" for name in ("can1", "vcan1", "slcan", "can1", "can200")))
-    assert [frame[3] for frame in whole(path)] == [1, 0, 2, 1, 3]
-
-
 def test_a_blf_of_other_tools_is_read(tmp_path: Path) -> None:
     """Type 86 objects, version 2 headers, times in 10 µs, padding, an uncompressed container, unknown objects."""
     body = struct.pack("<HBBL8sLBBH", 2, 0, 3, 0x123, b"abc", 0, 0, 0, 0)
@@ -176,11 +164,6 @@ def test_mcap_keeps_everything(frames: list[Frame]) -> None:
         assert whole(path) == frames
 
 
-def test_error_frames_keep_their_class_in_a_candump(tmp_path: Path) -> None:
-    frames: list[Frame] = [(10**15, 0x44 | ERR_FLAG, bytes(8), 0)]
-    assert whole(write_log(tmp_path / "a.log", frames)) == frames
-
-
 def write_mcap(path: Path, batches: list[list[Frame]]) -> None:
     file = LogFile(path.open("wb"), batches[0][0][0])
     for batch in batches:
@@ -216,27 +199,7 @@ def test_a_part_by_time_is_from_its_start_to_before_its_end(tmp_path: Path, suff
     assert [f for batch in read_frames(path, None, end) for f in batch] == frames[:6789]
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".blf", ".log"])
-def test_batches_stay_small(tmp_path: Path, suffix: str) -> None:
-    path = written(tmp_path, ordinary(20_000), suffix)
-    assert max(map(len, read_frames(path))) <= 1200
-
-
 # --- damage ----------------------------------------------------------------------------------------------------
-
-
-def test_times_that_no_log_can_hold_are_left_out_and_told(tmp_path):
-    stamps = ["1.0", "-5.0", "-5.0", "2.0", "99999999999999.0", "3.0"]
-    path = tmp_path / "odd.log"
-    path.write_text("".join(f"({stamp}) can0 123#11\n" for stamp in stamps))
-    frames, damages = read(path)
-    assert [frame[0] for frame in frames] == [10**9, 2 * 10**9, 3 * 10**9]
-    assert [damage.count for damage in damages] == [len(stamps) - len(frames)]
-    with (tmp_path / "odd.mcap").open("wb") as file:  # as the log of an estimate of it is written
-        log = LogFile(file, frames[0][0], {}, {})
-        log.frames(frames)
-        log.close()
-    assert read(tmp_path / "odd.mcap") == (frames, [])
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".blf", ".log"])
@@ -277,21 +240,6 @@ def test_a_line_cut_short_is_no_frame(tmp_path: Path, suffix: str) -> None:
         assert all(len(frame[2]) == 8 for frame in read(path)[0])
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf"])
-def test_a_cut_gzip_is_read_up_to_the_cut(tmp_path: Path, suffix: str) -> None:
-    frames = ordinary(20_000)
-    path = written(tmp_path, frames, suffix)
-    packed = gzip.compress(path.read_bytes())
-    cut = tmp_path / f"cut{suffix}.gz"
-    cut.write_bytes(packed[: len(packed) // 2])
-    there, damages = read(cut)
-    assert there == frames[: len(there)]
-    assert len(there) > 5000
-    assert len(damages) == 1
-    cut.write_bytes(packed)
-    assert whole(cut) == frames
-
-
 @pytest.mark.parametrize("suffix", [".mcap", ".blf"])
 @given(st.integers(0, 10**9), st.binary(min_size=1, max_size=300))
 @settings(deadline=None, max_examples=30)
@@ -327,34 +275,6 @@ def test_broken_lines_are_skipped_counted_and_the_first_one_named(tmp_path: Path
     assert "line 1500" in str(damages[0])
 
 
-def test_nine_bytes_and_twelve_bits_are_no_classic_frame(tmp_path: Path) -> None:
-    path = tmp_path / "a.log"
-    good = "(1.000000) can0 123#00\n"
-    path.write_text(
-        good + "(1.000000) can0 123#001122334455667788\n(1.000000) can0 FFF#00\n(1.0) can0 1##000112233445566778899\n"
-    )
-    there, damages = read(path)
-    assert len(there) == 1
-    assert damages[0].count == 3
-
-
-@pytest.mark.parametrize("suffix", [".asc", ".trc", ".csv"])
-def test_broken_lines_of_python_cans_formats_are_skipped_too(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    with can.Logger(path) as writer:
-        for i in range(50):
-            writer(can.Message(timestamp=START_S + i, arbitration_id=i, data=[i], is_extended_id=False, channel=0))
-    lines = path.read_text().splitlines(keepends=True)
-    place = next(i for i, line in enumerate(lines) if i > 35)
-    broken = {".asc": "1.5 1 Q Rx d 1 ZZ\n", ".trc": "9 1.0 DT 1 XYZ Rx - 1 00\n", ".csv": "1,0x1,0\n"}[suffix]
-    lines[place] = broken
-    path.write_text("".join(lines))
-    there, damages = read(path)
-    assert len(there) == 49
-    assert [frame[2][0] for frame in there] == sorted({frame[2][0] for frame in there})
-    assert [(d.count, d.place) for d in damages] == [(1, f"line {place + 1}")]
-
-
 # --- not what it says it is ------------------------------------------------------------------------------------
 
 
@@ -381,52 +301,11 @@ def test_a_file_of_another_format_is_refused(tmp_path: Path, name: str, content:
     assert name in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("a.pcap", b"\xd4\xc3\xb2\xa1\x02\x00\x04\x00" + bytes(60), "Wireshark.*candump -L"),
-        ("a.pcapng", b"\n\r\r\n" + bytes(60), "Wireshark"),
-        ("a.csv", b"time,addr,bus,data\n0.000,0x1d2,0,0x01\n", "cabana"),
-        ("a.txt", b"# Logger type: CL2000\n# HW rev: 7.xx\nTimestamp;Type;ID;Data\n0.000;0;1d2;01\n", "CL2000"),
-        ("a.log", b"***BUSMASTER Ver 3.2.2***\n***PROTOCOL CAN***\n", "BUSMASTER"),
-        ("a.mfc", b"Generic File\0\0\xc1\xdb\nt,\n" * 9, "CANedge.*mdf2finalized"),
-        ("a.bin", b"\x01\x02\0t,\x85t,\nt,1\n" * 9, "ends in '.bin'"),
-    ],
-)
-def test_a_log_of_another_tool_is_refused_by_its_name(tmp_path: Path, name: str, content: bytes, said: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
-    assert not logs.is_table(path)
-    with pytest.raises(InputError, match=f"{name}: is not a log that can be read: .*{said}"):
-        read_frames(path)
-
-
-def test_a_database_of_python_can_is_refused_with_what_converts_it(tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    with can.SqliteWriter(path) as writer:
-        writer(can.Message(timestamp=START_S, arbitration_id=1, data=[1]))
-    with pytest.raises(InputError, match="can_logconvert"):
-        read_frames(path)
-
-
-def test_frames_that_no_bus_carries_are_dropped_and_counted(tmp_path: Path) -> None:
-    path = tmp_path / "a.blf"
-    write_log(path, [(START_S * 10**9 + i, identifier, b"1", 0) for i, identifier in enumerate((0x7FF, 0x800))])
-    there, damages = read(path)
-    assert [frame[1] for frame in there] == [0x7FF]
-    assert [(damage.count, damage.reason) for damage in damages] == [(1, "identifier 800 has more than 11 bits")]
-
-
 def test_an_unknown_suffix_is_refused_with_the_nearest_and_all_known(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"did you mean '.mcap'.*\.blf"):
         read_frames(tmp_path / "a.mcpa")
     with pytest.raises(InputError, match=r"no suffix that tells its format"):
         read_frames(tmp_path / "ride")
-
-
-def test_a_missing_file_is_told_at_once(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
-        read_frames(tmp_path / "a.blf")
 
 
 def test_an_mcap_of_other_things_is_refused(tmp_path: Path) -> None:
@@ -465,17 +344,6 @@ else:
     subprocess.run([sys.executable, "-c", code, str(path)], check=True)
 
 
-def test_an_mf4_of_signals_says_which_it_holds(tmp_path: Path) -> None:
-    asammdf = pytest.importorskip("asammdf")
-    path = tmp_path / "a.mf4"
-    with asammdf.MDF(version="4.10") as file:
-        times = [0.0, 1.0]
-        file.append([asammdf.Signal([360.0, 359.0], times, name="PackVoltage", unit="V")])
-        file.save(path)
-    with pytest.raises(InputError, match=r"holds signals \(PackVoltage\) and no frames; save it as Parquet"):
-        read(path)
-
-
 def test_mf4_is_read_as_by_python_can(tmp_path: Path) -> None:
     pytest.importorskip("asammdf")
     from gz_onboard.recording.readers.python_can import with_asammdf
@@ -506,71 +374,7 @@ def test_recorded_rides_are_read_as_by_python_can() -> None:
         assert same(whole(path), by_python_can(path), 600), path
 
 
-def test_what_is_lost_is_logged_where_nobody_listens(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = written(tmp_path, ordinary(2000), ".blf")
-    path.write_bytes(path.read_bytes()[:-100])
-    assert sum(map(len, read_frames(path))) > 0
-    assert "cut off" in caplog.text
-    assert zlib.crc32(path.read_bytes())  # reading has not touched the file's lock or content
-    assert logs.read_metadata(path) == {}
-
-
 # --- hostile ---------------------------------------------------------------------------------------------------
-
-LAST_NS = (1 << 63) - 1
-
-
-def hostile_block(first: int, steps: list[int], unit: int = 1) -> bytes:
-    """A block of frames that begins at `first` [ns], with these steps between them [units], whatever they are."""
-    packed = b"".join(step.to_bytes(8, "little", signed=True) for step in steps)
-    count = len(steps) + 1
-    head = struct.pack("<BBHIqI", 1, 8, 1, count, first, unit) + struct.pack("<IBB", 1, 0, 2) + bytes(count)
-    return head + b"".join(packed[i::8] for i in range(8)) + bytes(2 * count)
-
-
-def with_messages(path: Path, *messages: tuple[int, bytes]) -> None:
-    """One of our logs with ordinary frames, and besides messages of any content on its topic of frames."""
-    file = LogFile(path.open("wb"), START_S * 10**9)
-    file.frames(ordinary(50))
-    file.flush()
-    for stamp, data in messages:
-        file._writer.add_message(file._frames_channel, stamp, data, stamp)
-    file.close()
-
-
-@pytest.mark.parametrize(
-    ("first", "steps", "unit", "kept"),
-    [
-        (-5, [10], 1, [5]),
-        (-(1 << 63), [(1 << 63) - 1, 7], 1, [6]),
-        (LAST_NS - 1, [1, 1], 1, [LAST_NS - 1, LAST_NS]),
-        (1, [1 << 62], 0xFFFF_FFFF, [1]),
-    ],
-)
-def test_a_time_that_is_none_is_left_out_and_told(
-    tmp_path: Path, first: int, steps: list[int], unit: int, kept: list[int]
-) -> None:
-    path = tmp_path / "a.mcap"
-    with_messages(path, (START_S, hostile_block(first, steps, unit)))
-    there, damages = read(path)
-    assert there[:50] == ordinary(50)
-    assert [frame[0] for frame in there[50:]] == kept
-    assert damages[0].count == len(steps) + 1 - len(kept)
-    assert "is no time" in str(damages[0])
-    for name in ("out.log", "out.blf", "out.mcap", "out.asc", "out.trc", "out.csv"):
-        arguments = argparse.ArgumentParser()
-        export.add_arguments(arguments)
-        dbc = ["--dbc", str(find_dbc("range.dbc"))] if name == "out.mcap" else []
-        assert export.run(arguments.parse_args([str(path), str(tmp_path / name), *dbc])) == 0
-
-
-@pytest.mark.parametrize("line", ["(18446744073709.551616) can0 123#00", "(99999999999999999999.0) can0 123#00"])
-def test_a_time_beyond_all_formats_in_a_candump(tmp_path: Path, line: str) -> None:
-    path = tmp_path / "a.log"
-    path.write_text(f"(1.000000) can0 123#00\n{line}\n(2.000000) can0 123#00\n")
-    there, damages = read(path)
-    assert [frame[0] for frame in there] == [10**9, 2 * 10**9]
-    assert damages[0].count == 1
 
 
 def chunk_at(data: bytes | bytearray, number: int) -> int:
@@ -585,20 +389,6 @@ def three_chunks(path: Path) -> list[Frame]:
     frames = ordinary(1500)
     write_mcap(path, [frames[:500], frames[500:1000], frames[1000:]])
     return frames
-
-
-@pytest.mark.parametrize("size", [1 << 63, (1 << 64) - 1, 1 << 40, 100 << 30, 0, 1])
-def test_a_chunk_of_another_size_than_it_says_is_left_out(tmp_path: Path, size: int) -> None:
-    path = tmp_path / "a.mcap"
-    frames = three_chunks(path)
-    data = bytearray(path.read_bytes())
-    at = chunk_at(data, 1)
-    data[at + 16 : at + 24] = size.to_bytes(8, "little")
-    path.write_bytes(data)
-    there, damages = read(path)
-    assert there == frames[:500] + frames[1000:]
-    assert damages[0].count == 1
-    assert list(read_samples(path)) == []
 
 
 def test_a_damaged_first_chunk_loses_only_its_own_frames_and_samples(tmp_path: Path) -> None:
@@ -623,20 +413,6 @@ def test_a_damaged_first_chunk_loses_only_its_own_frames_and_samples(tmp_path: P
     (tmp_path / "b.mcap").write_bytes(data)
     assert 0 < len(list(read_samples(tmp_path / "b.mcap"))) < before
     assert set(json_channels(tmp_path / "b.mcap")) == {"/estimate"}
-
-
-@pytest.mark.parametrize(("at", "mask"), [(-9, 0x03), (7, 0x40)], ids=["opcode", "start time"])
-def test_a_chunk_whose_head_is_damaged_is_told_or_read(tmp_path: Path, at: int, mask: int) -> None:
-    path = tmp_path / "a.mcap"
-    frames = three_chunks(path)
-    data = bytearray(path.read_bytes())
-    data[chunk_at(data, 1) + at] ^= mask
-    path.write_bytes(data)
-    there, damages = read(path)
-    assert there == frames or [damage.count for damage in damages] == [1]
-    end_ns = frames[-1][0] + 1
-    part = [frame for batch in read_frames(path, frames[0][0], end_ns, damages.append) for frame in batch]
-    assert part == there
 
 
 BOMB = """
@@ -667,22 +443,6 @@ def test_a_bomb_does_not_go_off(tmp_path: Path, told: bool) -> None:
     assert not out.stderr
     assert out.stdout.split()[-1] == "1000"
     assert "a chunk is broken" in out.stdout
-
-
-@pytest.mark.parametrize(
-    "text", [b"{", b"[1]", b"\xff", b'{"a": ' + b"9" * 5000 + b"}", b"[" * 100_000, b"3", b'{"a": 1}']
-)
-def test_samples_that_are_no_json_objects_are_passed_over(tmp_path: Path, text: bytes) -> None:
-    path = tmp_path / "a.mcap"
-    file = LogFile(path.open("wb"), START_S)
-    file.channel("/estimate", {"type": "object"})
-    file.sample("/estimate", 1, {"a": 0})
-    file._writer.add_message(file._channels["/estimate"], 2, text, 2)
-    file._writer.add_message(file._channels["/estimate"], 1 << 63, b"{}", 2)
-    file.sample("/estimate", 3, {"a": 2})
-    file.close()
-    found = [values for _, _, values in read_samples(path)]
-    assert found == [{"a": 0}, *([{"a": 1}] if text == b'{"a": 1}' else []), {"a": 2}]
 
 
 @given(st.integers(0, 10**9), st.binary(min_size=1, max_size=20))

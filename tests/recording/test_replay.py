@@ -13,11 +13,10 @@ import can
 import pytest
 
 from gz_onboard.can.logfile import LogFile
-from gz_onboard.errors import InputError
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from gz_onboard.events import EFF_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording import replay as command
 from gz_onboard.recording.readers.python_can import frame_of
-from gz_onboard.recording.replay import Sent, bus_sender, replay
+from gz_onboard.recording.replay import bus_sender, replay
 from tests.support import HEARS_CTRL_C, write_log
 
 START = 1_750_000_000_000_000_000
@@ -116,21 +115,6 @@ def test_speed_divides_the_time_and_zero_means_no_waiting(speed: float, seconds:
     assert seconds * 0.99 <= time.monotonic() - begin < seconds + 5
 
 
-def test_time_that_goes_back_does_not_stop_the_replay() -> None:
-    content = [*frames(10), *frames(10)]
-    assert replay([content], lambda _: True).sent == 20
-
-
-def test_a_part_is_chosen_in_seconds_from_the_start(
-    tmp_path: Path, listener: Listener, request: pytest.FixtureRequest
-) -> None:
-    content = frames(1000)  # 5 s
-    path = log(tmp_path, content)
-    arguments = ["--interface", "virtual", "--channel", request.node.name, "--speed", "0"]
-    assert run(path, *arguments, "--from", "1", "--to", "2.5") == 0
-    assert payload(listener.close()) == payload(content[200:500])
-
-
 def test_what_we_sent_ourselves_is_replayed_only_when_asked_for(
     tmp_path: Path, listener: Listener, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,15 +141,6 @@ def test_channels_of_the_log_go_to_channels_of_the_bus(tmp_path: Path, request: 
         assert payload(one.close()) == payload([frame for frame in content if frame[3] == i])
 
 
-def test_error_frames_are_left_out_and_counted(
-    tmp_path: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = log(tmp_path, [*frames(5), (START + 10**9, 0x44 | ERR_FLAG, bytes(8), 0)])
-    run(path, "--interface", "virtual", "--channel", request.node.name, "--speed", "0")
-    assert "5 frames in" in (text := capsys.readouterr().out)
-    assert "1 frames left out" in text
-
-
 def test_looping_ends_cleanly_on_an_interrupt(tmp_path: Path) -> None:
     path = log(tmp_path, frames(20))
     code = (
@@ -184,20 +159,6 @@ def test_looping_ends_cleanly_on_an_interrupt(tmp_path: Path) -> None:
     assert "Traceback" not in err
 
 
-def test_a_full_queue_is_waited_for() -> None:
-    class Busy:
-        attempts = 0
-
-        def send(self, _message: can.Message) -> None:
-            self.attempts += 1
-            if self.attempts % 3:
-                raise can.CanOperationError("full", error_code=105)
-
-    bus = Busy()
-    summary = replay([frames(10)], bus_sender(bus), 0)  # type: ignore[arg-type]
-    assert (summary.sent, summary.failed, bus.attempts) == (10, 0, 30)
-
-
 def test_a_bus_that_is_down_loses_frames_and_they_are_counted() -> None:
     class Down:
         def send(self, _message: can.Message) -> None:
@@ -206,31 +167,3 @@ def test_a_bus_that_is_down_loses_frames_and_they_are_counted() -> None:
     summary = replay([frames(10)], bus_sender(Down()), 0)  # type: ignore[arg-type]
     assert (summary.sent, summary.failed) == (0, 10)
     assert "10 frames could not be sent" in str(summary)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--speed", "-1"], "--speed -1"),
-        (["--speed", "nan"], "--speed nan"),
-        (["--from", "-1"], "--from -1 s"),
-        (["--from", "3", "--to", "2"], "--to 2 s"),
-        (["--from", "1000"], "no frames to send"),
-        (["--interface", "virtul"], "did you mean 'virtual'"),
-    ],
-)
-def test_bad_arguments_are_named(tmp_path: Path, arguments: list[str], said: str) -> None:
-    path = log(tmp_path, frames(10))
-    with pytest.raises(InputError, match=said):
-        run(path, "--interface", "virtual", "--channel", "bad", *arguments)
-
-
-def test_a_missing_channel_is_named(tmp_path: Path) -> None:
-    path = log(tmp_path, frames(10))
-    with pytest.raises(InputError, match="--channel nosuchcan0"):
-        run(path, "--interface", "socketcan", "--channel", "nosuchcan0")
-
-
-def test_summary_tells_what_matters() -> None:
-    text = str(Sent(sent=5, duration_s=1.25, worst_lateness_s=0.0123, loops=2))
-    assert text == "5 frames in 1.2 s, at worst 12.3 ms late, 2 rounds"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,19 +45,6 @@ def test_a_gap_loses_nothing(gaps):
         times += [times[-1] + gap + 10 * i for i in range(count)]
     frames = stamped(times)
     assert told_apart(frames) == (frames, [])
-
-
-@given(times=st.lists(st.integers(0, 60_000), min_size=1, max_size=19))
-def test_where_frames_are_few_none_is_odd(times):
-    frames = stamped(sorted(times))
-    assert told_apart(frames) == (frames, [])
-
-
-@pytest.mark.parametrize(("last", "odd"), [(9000, 1), (400, 0)])
-def test_a_log_that_comes_all_the_time_does_not_end_in_one_frame_after_a_gap(last, odd):
-    frames = stamped([*range(0, 1000, 10), 990 + last])
-    kept, left_out = told_apart(frames)
-    assert (kept, left_out) == (frames[: len(frames) - odd], frames[len(frames) - odd :])
 
 
 def test_frames_of_two_channels_may_overtake_each_other():

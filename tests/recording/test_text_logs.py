@@ -38,15 +38,6 @@ def test_savvycan_with_the_direction(tmp_path, name):
     ]
 
 
-def test_savvycan_without_the_direction_and_its_zeros_behind_the_data(tmp_path):
-    text = (
-        "Time Stamp,ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n166064000,0000021A,false,3,2,FE,36,00,00,00,00,00,00\n"
-    )
-    assert frames_of(tmp_path, text, "r.csv") == [(166064000_000, 0x21A, b"\xfe\x36", 3)]
-    text = "Time Stamp (uS),ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\r\n005336724,0F1,0,1,2, 00,02,\r\n"
-    assert frames_of(tmp_path, text) == [(5336724_000, 0x0F1, b"\x00\x02", 1)]
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -58,12 +49,6 @@ def test_savvycan_without_the_direction_and_its_zeros_behind_the_data(tmp_path):
 def test_a_byte_order_mark_costs_no_line(tmp_path, text):
     ((time, identifier, data, _),) = frames_of(tmp_path, f"\xef\xbb\xbf{text}")
     assert (time, identifier, data) == (1_700_000_000 * S, 0x120, b"\x90")
-
-
-def test_savvycan_times_before_its_clock_was_set_begin_at_zero(tmp_path, caplog):
-    text = f"{SAVVYCAN}-1621841258567223,1D0,false,Rx,0,1,6C,\n-1621841258567009,2C4,false,Rx,0,1,FF,\n"
-    assert [frame[0] for frame in frames_of(tmp_path, text, "r.csv")] == [0, 214_000]
-    assert "unknown start" in caplog.text
 
 
 def test_savvycan_lines_that_are_none_are_counted_and_the_first_named(tmp_path):
@@ -103,12 +88,6 @@ def test_candump_as_on_the_screen(tmp_path):
     ]
 
 
-def test_candump_without_a_time_is_at_zero_and_says_so(tmp_path, caplog):
-    frames = frames_of(tmp_path, "  can0  120   [4]  11 22 33 44\n  can0  121   [1]  11\n", "ride.log")
-    assert [(frame[0], frame[1]) for frame in frames] == [(0, 0x120), (0, 0x121)]
-    assert "has no times" in caplog.text
-
-
 def test_candump_times_since_the_start_and_since_the_frame_before(tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     zero = "".join(f" (000.{i}00000)  can0  120   [1]  0{i}\n" for i in range(9))
@@ -120,13 +99,6 @@ def test_candump_times_since_the_start_and_since_the_frame_before(tmp_path, capl
     assert "added up" in caplog.text
 
 
-def test_a_screen_line_of_another_length_than_it_says_is_no_frame(tmp_path):
-    damages: list[LogDamage] = []
-    text = " (1.0)  can0  120   [4]  11 22 33 44\n (1.1)  can0  120   [4]  11 22 33\n"
-    assert len(frames_of(tmp_path, text, damages=damages)) == 1
-    assert damages[0].place == "line 2"
-
-
 ASC = "0.100000 1  64              Rx   d 2 64 0A\n   0.200000 2  1Fx             Tx   d 1 10\n"
 
 
@@ -134,20 +106,6 @@ def test_asc_without_a_header_loses_no_frame(tmp_path):
     expected = [(100 * MS, 0x64, b"\x64\x0a", 0), (200 * MS, 0x1F | EFF_FLAG, b"\x10", 1 | TRANSMITTED)]
     for name in ("ride.asc", "ride.txt"):
         assert frames_of(tmp_path, ASC, name) == expected
-
-
-def test_asc_of_base_ten_behind_a_line_that_python_can_does_not_know(tmp_path):
-    text = "\ndate Tue May 27 04:09:35.000 pm 2014\n// hello\nbase dec  timestamps absolute\n" + ASC.replace("0A", "10")
-    damages: list[LogDamage] = []
-    frames = frames_of(tmp_path, text.replace("1Fx", "31x"), "ride.asc", damages)
-    assert [(frame[1], frame[2]) for frame in frames] == [(64, b"\x40\x0a"), (31 | EFF_FLAG, b"\x0a")]
-
-
-def test_asc_with_times_since_the_line_before(tmp_path):
-    text = (
-        f"date Tue May 27 04:09:35.000 pm 2014\nbase hex  timestamps relative\n{ASC}   0.5 1  Statistic: D 0 R 0\n{ASC}"
-    )
-    assert [frame[0] // MS for frame in frames_of(tmp_path, text, "ride.asc")] == [100, 300, 900, 1100]
 
 
 def test_asc_fd_remote_and_error_frames_and_a_length_code_beyond_eight(tmp_path):
@@ -171,18 +129,6 @@ def test_asc_fd_remote_and_error_frames_and_a_length_code_beyond_eight(tmp_path)
     assert [(damage.count, damage.place) for damage in damages] == [(1, "line 9")]
 
 
-def test_trc_with_can_fd(tmp_path):
-    text = (
-        ";$FILEVERSION=2.1\n;$STARTTIME=43008.9206666667\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
-        "      1      1059.900 FD 1     0300 Rx -  9    00 01 02 03 04 05 06 07 08 09 0A 0B\n"
-        "      2      1283.231 DT 1     0321 Tx -  2    01 02\n"
-    )
-    assert [(frame[1], frame[2]) for frame in frames_of(tmp_path, text, "ride.trc")] == [
-        (0x300, bytes(range(12))),
-        (0x321, b"\x01\x02"),
-    ]
-
-
 PCAN_1_2 = (
     ";$FILEVERSION=1.2\n;$STARTTIME=45000.5\n;\n;---+-- ------+------ +- --+-- ---+---- + -+ -- --\n"
     "     1)        12.345 1  Rx        0100 2  10 0E \n"
@@ -196,21 +142,6 @@ def test_pcan_traces_of_version_1_2_are_read(tmp_path):
         (noon_ns + 12_345_000, 0x100, b"\x10\x0e", 0),
         (noon_ns + 512_345_000, 0x18FF50E5 | EFF_FLAG, b"\x90", TRANSMITTED),
     ]
-
-
-@pytest.mark.parametrize("line", ["     3)", "11,201 0F1      4 34 01 00 40", "     3)  600.0 1  Rx  0FFF 1  90 "])
-def test_lines_that_are_none_of_a_pcan_trace_are_counted_in_silence(tmp_path, line, caplog):
-    damages: list[LogDamage] = []
-    assert len(frames_of(tmp_path, f"{PCAN_1_2}{line}\n", "ride.trc", damages)) == 2
-    assert [damage.count for damage in damages] == [1]
-    assert not [record for record in caplog.records if record.name.startswith("can")]
-
-
-def test_a_trace_of_canhacker_is_refused_in_silence(tmp_path, caplog):
-    text = "Time   ID     DLC Data                    Comment\n" + "11,201 002      4 34 01 00 40             \n" * 40
-    with pytest.raises(InputError, match=r"ride.trc, line 1: not a PCAN trace: it has neither"):
-        frames_of(tmp_path, text, "ride.trc")
-    assert not caplog.records
 
 
 def test_the_content_tells_the_format_also_of_a_packed_log_and_against_its_name(tmp_path):

@@ -53,15 +53,6 @@ def test_missing_heights_are_filled_with_a_warning(tmp_path, caplog, held, rows)
     assert f"way.gpx: point {rows[0] + 1}: {len(rows)} of 40 heights are missing" in caplog.text
 
 
-@pytest.mark.parametrize(
-    "heights", [[0.0] * 20, [0, 0, 0, 4, 6, 8, 9, 9, 3, 0, 0], [100, 102, 99, 103, 100], [0, 8, 0]]
-)
-def test_heights_of_a_road_are_left_alone(tmp_path, caplog, heights):
-    points = [(47.0 + 0.0002 * i, 8.0, z) for i, z in enumerate(heights)]
-    assert read_route_columns(gpx(tmp_path, points)).values["altitude_m"] == tuple(heights)
-    assert not caplog.text
-
-
 PART = [(47.0 + 0.0002 * i, 8.0, 400.0) for i in range(20)]
 AROUND = {"tracks": "</trkseg></trk><trk><trkseg>", "segments": "</trkseg><trkseg>", "routes": "</rte><rte>"}
 
@@ -82,18 +73,6 @@ def test_parts_that_do_not_join_are_refused(tmp_path, around):
     told = r"way\.gpx: point 21: has 2 tracks or segments, which do not join: 2\.9 km lie before this one"
     with pytest.raises(InputError, match=told):
         read_route(in_two(tmp_path, PART, away, around))
-
-
-@pytest.mark.parametrize("around", AROUND)
-def test_parts_that_join_are_one_road(tmp_path, around):
-    on = [(y + 0.0043, x, z) for y, x, z in PART]  # 56 m further on
-    route = read_route(in_two(tmp_path, PART, on, around))
-    assert route.length == pytest.approx(0.0081 * 111_180, rel=1e-3)
-
-
-def test_a_track_that_stood_is_passed_over(tmp_path):
-    points = [(47.0 + 0.0002 * max(i - 5, 0), 8.0, 400.0) for i in range(12)]
-    assert len(read_route(gpx(tmp_path, points)).distance) == 7
 
 
 def test_stops_and_winds_of_a_csv(tmp_path):
@@ -166,11 +145,6 @@ def test_csv_refused(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(InputError, match=message):
         read_route(file)
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"gone\.gpx: cannot be read: No such file"):
-        read_route(tmp_path / "gone.gpx")
 
 
 def test_a_packed_file_that_unpacks_to_a_huge_one_is_refused_before_it_is_parsed(tmp_path, monkeypatch):

@@ -87,19 +87,6 @@ def test_straight_then_bend_then_straight_turns_by_the_right_angle(tmp_path):
     assert at(way, "curvature", 450.0) == pytest.approx(0.0, abs=1e-4)
 
 
-def test_date_line_is_crossed_in_a_short_step(tmp_path):
-    way = road(tmp_path, [(0.0, 179.9998, 0.0), (0.0, 180.0, 0.0), (0.0, -179.9998, 0.0)], POSITIONS)
-    assert way.length == pytest.approx(44.53, abs=0.05)
-
-
-def test_given_curvature_is_kept_and_gives_the_heading(tmp_path):
-    header = "distance_m,altitude_m,curvature_1pm"
-    way = road(tmp_path, [(20.0 * i, 0.0, 0.0 if i < 5 else 0.01) for i in range(11)], header)
-    assert at(way, "curvature", 180.0) == 0.01
-    assert at(way, "curvature", 90.0) == pytest.approx(0.005)
-    assert at(way, "heading", 200.0) == pytest.approx(-1.1)
-
-
 @given(slope=st.floats(-0.1, 0.1), start=st.floats(-100, 1000), spacing=st.sampled_from([1.0, 7.0, 20.0, 500.0]))
 def test_even_hill_has_its_grade_everywhere(tmp_path_factory, slope, start, spacing):
     points = [(start + spacing * i, 4000 + start + slope * spacing * i) for i in range(60)]
@@ -123,13 +110,6 @@ def test_altitude_noise_makes_no_spikes(tmp_path, seed):
     errors = [g - 0.02 for g in way.grade]
     assert max(map(abs, errors)) < 0.025  # a difference of neighbours reaches 0.2
     assert math.sqrt(sum(e * e for e in errors) / len(errors)) < 0.006
-
-
-def test_distance_begins_with_zero_and_limits_are_in_metres_per_second(tmp_path):
-    points = [(100.0, 10.0, 36.0), (150.0, 20.0, 72.0), (200.0, 20.0, 18.0)]
-    way = road(tmp_path, points, "distance_m,altitude_m,speed_limit_kmh")
-    assert (way.length, way.name) == (100.0, "way")
-    assert way.speed_limit == pytest.approx([10, 20, 5])
 
 
 @pytest.mark.parametrize(
@@ -197,13 +177,6 @@ def test_no_limit_is_exceeded_anywhere(way, a_y, a, b, where):
     for (d0, v0), (d1, v1) in pairwise(zip(*profile, strict=True)):
         change = (v1 * v1 - v0 * v0) / (2 * (d1 - d0))
         assert -b * (1 + 1e-6) - 1e-9 <= change <= a * (1 + 1e-6) + 1e-9
-
-
-@given(way=routes(), slower=st.floats(0.3, 1.0))
-def test_stricter_limits_never_make_it_faster(way, slower):
-    usual, strict = speed_profile(way), speed_profile(way, lateral_acceleration=2.5 * slower, top_speed=10.0)
-    assert all(v <= u + 1e-9 for v, u in zip(strict[1], usual[1], strict=True))
-    assert duration(strict) >= duration(usual) - 1e-9
 
 
 def test_straight_road_is_a_trapezium():

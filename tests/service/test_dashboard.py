@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -69,11 +67,3 @@ def test_it_shows_the_daemon_and_outlives_it(page, service, ride):
     systemctl("start", UNIT)
     wait_for(lambda: latest()["range"]["km"] is not None, 60, "the range again")
     assert pid() == before
-
-
-def test_killed_or_hung_it_is_started_again(page):
-    for number in signal.SIGKILL, signal.SIGSTOP:
-        before = pid()
-        os.kill(before, number)
-        wait_for(lambda old=before: active() and pid() not in (0, old), 60, "started again")  # type: ignore[misc]
-        assert latest()["alerts"] == ["silent"]

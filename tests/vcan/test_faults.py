@@ -6,20 +6,17 @@ import os
 import signal
 import socket
 import struct
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from statistics import median
 
 import pytest
 
 from gz_onboard import state
-from gz_onboard.can.recorder import is_complete
-from gz_onboard.events import EFF_FLAG, State
+from gz_onboard.events import State
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
 from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
 
@@ -32,9 +29,6 @@ def sender(channel: str = "vcan0") -> Iterator[socket.socket]:
         raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         raw.bind((channel,))
         yield raw
-
-
-HELD_UP = 0.5  # s: a machine that is so busy holds up the sender, too, and its signals are rightly missed
 
 
 @contextmanager
@@ -207,75 +201,6 @@ def test_the_interface_is_taken_away_and_comes_back(running: Running, listener: 
     daemon.stop()
 
 
-@pytest.mark.administers
-def test_started_before_there_is_an_interface(running: Running, listener: Listener):
-    ip("link", "delete", "vcan0")
-    daemon = running.daemon()
-    time.sleep(2)
-    ip("link", "add", "dev", "vcan0", "type", "vcan")
-    time.sleep(2)  # there, and down
-    assert daemon.process.poll() is None
-    ip("link", "set", "vcan0", "up")
-    listener.wait_for_new("RANGE_Status", 5, RANGE_StatusState=State.STARTING)
-    with steady_ride():
-        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    daemon.stop()
-
-
-def test_two_channels(running: Running, listener: Listener):
-    daemon = running.daemon(channels=("vcan0", "vcan1"))
-    with steady_ride("vcan0", "vcan1"):
-        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-        time.sleep(3)
-    summary = daemon.stop()
-    frames = raw_frames(daemon.logs[-1])
-    assert number(summary, r"received (\d+)") == len(frames)
-    assert {frame[3] for frame in frames if frame[1] < 0x400} == {0}
-    assert {frame[3] for frame in frames if frame[1] >= 0x400} == {1}
-    assert all(b[0] >= a[0] for a, b in pairwise(frames))  # in the order of time, whatever the channel
-    assert not number(summary, r"dropped (\d+)")
-    assert daemon.estimates()[-2]["speed"] == pytest.approx(10.0, abs=0.01)
-
-
-@pytest.mark.administers
-def test_one_of_two_channels_goes_down(running: Running, listener: Listener):
-    daemon = running.daemon(channels=("vcan0", "vcan1"))
-    with steady_ride("vcan0", "vcan1"):
-        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-        ip("link", "set", "vcan1", "down")
-        try:
-            found = listener.wait_for_new("RANGE_Status", 5, RANGE_BusDown=1, RANGE_NoImu=1)
-            assert found["RANGE_StatusState"] == State.DEGRADED
-            assert found["RANGE_StateOfCharge"] <= 100
-        finally:
-            ip("link", "set", "vcan1", "up")
-        listener.wait_for_new("RANGE_Status", 6, RANGE_BusDown=0, RANGE_StatusState=State.VALID)
-    daemon.stop()
-
-
-@pytest.mark.parametrize("all_frames", [True, False])
-def test_unknown_identifiers(running: Running, listener: Listener, all_frames: bool):
-    daemon = running.daemon(*(["--all-frames"] if all_frames else []))
-    with sender() as raw:
-        for _ in range(6):
-            for i in range(51):
-                raw.send(FRAME.pack(0x7E0 + i % 3, 8, bytes(8)))
-                raw.send(FRAME.pack(EFF_FLAG | 0x200, 8, bytes(8)))
-            for _ in range(2):  # rounds: of more at once a busy daemon leaves out what is too much
-                listener.wait_for_new("RANGE_Status", 10)
-        for frame in Scooter().steady(1.0):
-            raw.send(FRAME.pack(frame[1], 8, frame[2].ljust(8, b"\0")))
-        found = listener.wait_for_new("RANGE_Diagnosis", 5, RANGE_CountUnknown=4 if all_frames else 0)
-    summary = daemon.stop()
-    known = len(Scooter().steady(1.0))
-    assert found["RANGE_CountDropped"] <= known
-    strangers = [frame for frame in raw_frames(daemon.logs[-1]) if frame[1] in (0x7E0, 0x7E1, 0x7E2, EFF_FLAG | 0x200)]
-    assert len(strangers) == (612 if all_frames else 0)
-    assert number(summary, r"received (\d+)") == known + (612 if all_frames else 0)
-    unknown = daemon.statuses()[-1]["unknown"]
-    assert unknown == ({"0x7e0": 102, "0x7e1": 102, "0x7e2": 102, "0x00000200": 306} if all_frames else {})
-
-
 def dropped_on_the_way() -> int:
     """Frames of any interface that the kernel dropped because its queue of received ones was full."""
     return sum(int(line.split()[1], 16) for line in Path("/proc/net/softnet_stat").read_text().splitlines())
@@ -312,45 +237,6 @@ def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
     assert listener.decoded("RANGE_Diagnosis")[-1]["RANGE_CountLost"] == min(lost, 4094)
 
 
-@pytest.mark.administers
-@pytest.mark.skipif(not Path("/run/vcan-guest").is_dir(), reason="sets the clock: only in a guest")
-def test_the_clock_is_set(running: Running, listener: Listener):
-    started = time.clock_gettime(time.CLOCK_BOOTTIME)
-    daemon = running.daemon()
-    real = time.clock_gettime(time.CLOCK_BOOTTIME)
-    begin = time.time()
-
-    def set_clock(ahead: float) -> None:
-        now = begin + time.clock_gettime(time.CLOCK_BOOTTIME) - real
-        time.clock_settime(time.CLOCK_REALTIME, now + ahead)
-
-    try:
-        with steady_ride(), hold_ups() as held_up:
-            listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-            for ahead in (3600.0, -7200.0, 40.0):
-                set_clock(ahead)
-                time.sleep(4)
-                assert listener.decoded("RANGE_Status")[-1]["time"] == pytest.approx(time.time(), abs=1.0)
-    finally:
-        set_clock(0.0)
-    wait_for(lambda: daemon.journal.count("the clock was set") == 4, 5, "the daemon says that the clock was set")
-    daemon.stop()
-    elapsed = time.clock_gettime(time.CLOCK_BOOTTIME) - started
-    rows = daemon.estimates()
-    steps = [b["time"] - a["time"] for a, b in pairwise(rows)]
-    # A busy machine may hold the daemon up, but no time is in the log that did not pass, and none comes twice.
-    assert median(steps) == pytest.approx(1.0, abs=0.11)
-    assert min(steps) > 0.5, [round(step, 2) for step in steps]
-    assert sum(steps) < elapsed, [round(step, 2) for step in steps]
-    riding = [row for row in rows if row["speed"] is not None]
-    worse = [(row["state"], row["reasons"]) for row in riding[2:-2] if row["state"] != "VALID"]
-    assert not worse or max(held_up) > HELD_UP, worse
-    assert all(0 < b["distance"] - a["distance"] < 12 for a, b in pairwise(riding))
-    assert "implausible time" not in daemon.statuses()[-1]["faults"]
-    soc = [row["soc"] for row in riding if row["soc"] is not None]
-    assert max(soc) - min(soc) < 0.005
-
-
 def test_the_log_directory_cannot_be_written(running: Running, listener: Listener):
     blocked = running.folder("a") / "file"
     blocked.write_text("in the way")
@@ -361,55 +247,6 @@ def test_the_log_directory_cannot_be_written(running: Running, listener: Listene
         wait_for(lambda: "LOG_FAILED" in daemon.journal, 5, "the daemon says that it cannot write its log")
     daemon.stop()
     assert f"cannot write the log: [Errno 17] File exists: '{blocked}'" in daemon.journal
-
-
-@pytest.mark.administers
-def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
-    """Others fill it, and room again: the log leaves them their share, and goes on in a new file."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=False, capture_output=True
-    )
-    if mount.returncode:
-        pytest.skip(f"no mount here: {mount.stderr.decode()}")
-    try:
-        daemon = running.daemon("--log-dir", str(disk))
-        with steady_ride():
-            listener.wait_for_valid(4)
-            assert not listener.decoded("RANGE_Status")[-1]["RANGE_LogFailed"]
-            (disk / "ballast").write_bytes(bytes(1_800_000))
-            listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
-            wait_for(lambda: "cannot write the log" in daemon.journal, 10, "it says that the disk is full")
-            (disk / "ballast").unlink()
-            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
-            time.sleep(3)
-        daemon.stop()
-        logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
-        assert len(logs) >= 2
-        assert all(is_complete(log) for log in logs)
-        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))
-    finally:
-        running.kill()
-        subprocess.run(["umount", str(disk)], check=False)
-
-
-def test_two_daemons_on_one_bus(running: Running, tmp_path: Path):
-    """The second is refused and the first goes on; killed, it is followed at once."""
-    daemon = running.daemon()
-    for options, said in (
-        (["--channel", "vcan0"], "--channel vcan0: another gz-onboard run has it"),
-        (["--channel", "vcan1", "--state-dir", str(daemon.state_dir)], "another gz-onboard run uses it"),
-    ):
-        second = running.start("run", *options, stderr=subprocess.PIPE, text=True)
-        _, errors = second.communicate(timeout=60)
-        assert second.returncode == 2
-        assert said in errors
-    assert daemon.process.poll() is None
-    for _ in range(3):
-        daemon.process.kill()
-        daemon = running.daemon()
-    daemon.stop()
 
 
 def test_stopped_for_long_it_tells_nothing_old(running: Running, listener: Listener):
@@ -425,19 +262,3 @@ def test_stopped_for_long_it_tells_nothing_old(running: Running, listener: Liste
     daemon.stop()
     soc = [row["soc"] for row in daemon.estimates() if row["soc"] is not None]
     assert all(abs(b - a) < 0.002 for a, b in pairwise(soc))
-
-
-def test_killed_again_and_again_every_log_is_read(running: Running, listener: Listener):
-    with steady_ride():
-        for number in range(4):
-            daemon = running.daemon()
-            listener.wait_for_new("RANGE_Estimate", 20, RANGE_EstimateState=State.VALID)
-            time.sleep(1 + number % 3)
-            daemon.process.kill()
-            daemon.process.wait()
-        daemon = running.daemon()
-        listener.wait_for_new("RANGE_Estimate", 20, RANGE_EstimateState=State.VALID)
-    daemon.stop()
-    assert len(daemon.logs) == 5
-    assert all(raw_frames(log) for log in daemon.logs)
-    assert daemon.journal.count("continuing from the state saved") == 4
