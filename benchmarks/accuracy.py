@@ -1,10 +1,10 @@
-"""How good the estimates are on recorded rides: state of charge against a coulomb count, range against what was ridden.
+"""Measure estimates on recorded rides: state of charge against a coulomb count, range against the distance ridden.
 
     python benchmarks/accuracy.py RIDES_FOLDER        # folders of .blf files, each with its rides.json
 
 The reference for the state of charge is a coulomb count from the rest voltage at the start of the ride, with the
 pack current as recorded less its known offset and gain. For rides until the scooter gave up, the range is compared
-with the distance that was really ridden from where the count passed 80, 50 and 20 %, beside the estimator of a
+with the distance ridden from where the count passed 80, 50 and 20 %, and with the estimator of a
 common telematics module: the energy that the BMS' percentage leaves above 15 % (and, kinder, above 0), over the mean
 Wh/km of the last 25 km, 45 Wh/km until one kilometre has been ridden.
 """
@@ -81,7 +81,7 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
         if e.pack_current is None or e.pack_voltage is None:
             return
         dt = e.time - state["time"]
-        if state["first"] is None:  # at rest: what the count begins from
+        if state["first"] is None:  # at rest: start of the count
             state["first"] = e.pack_voltage, e.pack_current
         else:
             state["charge"] += e.pack_current * dt / 3600

@@ -1,7 +1,7 @@
 """The energy-only form: speed in, power out, for a whole ride at once.
 
 `physics.Model.power` with arrays in place of floats: no tyre slip, no rider, no limits of motor or pack, so it takes
-any speed as ridden. What a forward simulation finds beyond it is what those parts take.
+any speed as ridden. A forward simulation adds the energy of those parts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BLOCK = 8192  # steps at once: what stays in the processor's cache takes half th
 
 @dataclass(frozen=True)
 class Energy:
-    """A ride's power at the pack's terminals and what it is made of."""
+    """A ride's power at the pack's terminals, by effect."""
 
     power: Array  # W, of the length of the ride
     ledger: dict[str, float]  # J, by the names of `Model.power`

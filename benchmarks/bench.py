@@ -1,4 +1,4 @@
-"""What gz-onboard costs, beside the obvious pipeline of the same libraries (plain.py). See docs/results/benchmarks.md.
+"""Measure the cost of gz-onboard against the obvious pipeline of the same libraries (docs/results/benchmarks.md).
 
 All times are CPU time of the measured process alone, user and system together, read from its own CPU clock; medians
 over windows or repeats. On a kernel with CAN the frames go over a vcan, elsewhere over stand_in.py's sockets.
@@ -126,7 +126,7 @@ def bus() -> Iterator[tuple[list[str], socket.socket]]:
     """What to put before `MODULE ARGUMENT...` to run a program on the bus, and the socket to send on."""
     if has_can():
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sender:
-            sender.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # do not read what is answered
+            sender.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # do not read the answers
             sender.bind(("vcan0",))
             yield [sys.executable, "-m"], sender
         return
@@ -285,7 +285,7 @@ def hour_plain(repeats: int, seconds: float, *options: str) -> tuple[float, floa
 
 
 def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
-    """The log that the daemon would write of a whole recorded ride: bytes, frames received, share by what it holds.
+    """Write the daemon's log of a whole recorded ride: bytes, frames received, share of each topic.
 
     The daemon's own pipeline and recorder, called as its loop calls them, at the ride's times.
     """
@@ -316,8 +316,8 @@ def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
 
 
 def contents(log: Path) -> dict[str, float]:
-    """Bytes of a log by what they hold. Chunks hold several topics: their bytes are shared out by how large each
-    topic's messages are, compressed alone."""
+    """Return bytes of a log by topic. Chunks hold several topics: their bytes are shared in proportion to each
+    topic's messages, compressed alone."""
     import zstandard
     from mcap.records import Attachment, Chunk, Message
     from mcap.stream_reader import StreamReader, breakup_chunk

@@ -35,7 +35,7 @@ COLUMNS = ("t_s", "v_kmh", "v_batt_V", "i_batt_A", "soc_pct", "soc_disp_pct")
 
 @dataclass(frozen=True)
 class Car:
-    """What the car's own table says, row by row."""
+    """The car's own table, row by row."""
 
     time: list[float]  # s
     distance: list[float]  # m so far
@@ -56,7 +56,7 @@ class Trip:
     shown_rms: float
     modelled: float  # energy of the forward model
     at: float  # share of the way at which the range is judged
-    ours: float  # distance for what the rest took
+    ours: float  # distance for the energy of the rest
     rule: float  # the same, by kilometres over charge so far
     low: float  # P10 of the range over the range as the rest of the trip had it
     high: float  # P90
@@ -187,7 +187,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, help="of the trips")
     parser.add_argument("--vehicle", type=Path, default=VEHICLE, help="vehicle file, in place of the one of the page")
-    parser.add_argument("--write", type=Path, help="replace what stands in this file after its mark")
+    parser.add_argument("--write", type=Path, help="replace everything after the mark in this file")
     arguments = parser.parse_args()
     files = sorted(arguments.folder.glob(PATTERN))
     if not files:

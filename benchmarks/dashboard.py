@@ -1,4 +1,4 @@
-"""What the page of the dashboard costs: ``python -m benchmarks.dashboard``. It needs Chromium and Playwright.
+"""Measure the cost of the dashboard's page: ``python -m benchmarks.dashboard``. It needs Chromium and Playwright.
 
 The server runs with a sender of a daemon's frames in one process, as python-can's in-process bus ends there; the
 sender's CPU time is counted apart. The browser is another process, at 800 x 480.
@@ -90,7 +90,7 @@ def child(seconds: float) -> None:
 
 
 def measured(seconds: float, readers: int) -> tuple[dict[str, Any], list[float], list[float]]:
-    """What the child says, the delays [ms] from frame to page, and the times [ms] in which the page was loaded."""
+    """Return the child's figures, delays [ms] from frame to page, and load times [ms] of the page."""
     from tests.browser.support import opened_browser
 
     command = [sys.executable, "-m", "benchmarks.dashboard", "--child", "--seconds", str(seconds)]

@@ -1,4 +1,4 @@
-"""The scooter beside FASTSim 3 on the same drive cycles: python -m benchmarks.fastsim_compare
+"""Compare the scooter with FASTSim 3 on the same drive cycles: python -m benchmarks.fastsim_compare
 
 Needs a Python that has both the requirements of gz-onboard and PyPI's fastsim (3.1). Two comparisons:
 
@@ -71,7 +71,7 @@ class EfficiencyPack:
 
 def cycles() -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
     udds, wmtc = cycle("udds"), cycle("wmtc_class1")
-    factor = 45 / 3.6 / max(udds.speed)  # what the scooter reaches on the level, with some power left
+    factor = 45 / 3.6 / max(udds.speed)  # within the scooter's power on the level
     return {
         "UDDS scaled to 45 km/h": (udds.time, tuple(factor * v for v in udds.speed)),
         "WMTC class 1": (wmtc.time, wmtc.speed),

@@ -27,7 +27,7 @@ from tests.events import EventEstimator
 
 BASE = Path(__file__).with_name("a123.toml")
 TESTS = {"N15": -15.0, "P05": 5.0, "P25": 25.0, "P45": 45.0}  # degC, by the names of the files
-PAUSE = 3600.0  # s put between the discharge and the charge, which stand in two files
+PAUSE = 3600.0  # s put between the discharge and the charge, which are in two files
 STARTS = {0.0: "right", WRONG: "20 % too low"}
 PARTS = {"above 80 %": (0.8, 1.1), "20 to 80 %": (0.2, 0.8), "below 20 %": (-0.1, 0.2)}
 
@@ -116,7 +116,7 @@ def report(folder: Path) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("data", type=Path, help="folder of the cell's files")
-    parser.add_argument("--write", type=Path, help="replace what stands in this file after its mark")
+    parser.add_argument("--write", type=Path, help="replace everything after the mark in this file")
     arguments = parser.parse_args()
     lines = report(arguments.data)
     if arguments.write:

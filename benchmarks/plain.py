@@ -122,7 +122,7 @@ class Pipeline:
         self.writer.add_message(self.channels[topic], nanoseconds, json.dumps(values).encode(), nanoseconds)
 
     def take(self, message: can.Message) -> list[can.Message]:
-        """Decode, log and use one frame; gives what is to be sent."""
+        """Decode, log and use one frame; return the frames to send."""
         self.frames += 1
         try:
             definition = self.database.get_message_by_frame_id(message.arbitration_id)
@@ -174,7 +174,7 @@ class Pipeline:
         return messages
 
     def encode(self, name: str, values: dict[str, float]) -> can.Message:
-        """A message with counter and CRC; what is not given is zero."""
+        """A message with counter and CRC; missing signals are zero."""
         definition = self.range_database.get_message_by_name(name)
         part = name.removeprefix("RANGE_")
         complete: dict[str, float] = {signal.name: 0 for signal in definition.signals}
@@ -190,7 +190,7 @@ class Pipeline:
 
 
 def live(channel: str, log: Path) -> None:
-    """Until SIGTERM; says on standard output when it is ready and what it received."""
+    """Run until SIGTERM; report readiness and the frames received on standard output."""
     stopping = False
 
     def stop(*_: object) -> None:

@@ -57,7 +57,7 @@ TITLES = {
     "joined": "joined at 60 % of charge",
 }
 HEALTHY = "healthy", "journey"  # kinds whose packs and tyres are as their file says
-HALF = 0.5  # SOC from which on it is told, too, how often the interval holds the truth
+HALF = 0.5  # SOC from which on coverage is reported separately
 KEY = "range benchmark"  # of the vehicle, in its saved states
 ADVANCED = 20.0  # m between two looks at the interval
 COLUMNS = "ridden", "ours", "P10", "P90", "rival"

@@ -59,7 +59,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A full discharge by seed: who rides what, where and in which weather."""
+    """A full discharge by seed: rider, scooter, road and weather."""
 
     seed: int
     machine: int
@@ -114,7 +114,7 @@ def road_of(drawn: Drawn) -> Plan:
 
 
 def route_of(way: Plan, *, positions: bool = True) -> str:
-    """What a navigation service knows of the road, as CSV: position, altitude with its error, speed limit.
+    """Return the road as a navigation service knows it, as CSV: position, altitude with its error, speed limit.
 
     Without `positions` it has the curvature in their place: a ride of the plant strays from the positions of its road
     by up to 100 m in 50 km. The limit is what bends nearby leave of it. Where the rider will have to stop it does not

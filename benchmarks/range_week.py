@@ -40,7 +40,7 @@ class Ride:
 
 
 class Week:
-    """The week `seed`: who rides what, where and when. Each ride begins with the charge that the last one left."""
+    """The week `seed`: riders, scooters, roads and times. Each ride begins with the charge that the last one left."""
 
     def __init__(self, seed: int) -> None:
         self.seed, self.machine = seed, scooter(seed)

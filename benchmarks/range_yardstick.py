@@ -41,7 +41,7 @@ class Usual:
     _rows: deque[tuple[float, float]] = field(default_factory=deque)  # distance [m], energy [J]
 
     def ride(self, power: float, speed: float, dt: float) -> None:
-        """Go on for `dt` [s] at `power` [W] and `speed` [m/s]."""
+        """Continue for `dt` [s] at `power` [W] and `speed` [m/s]."""
         self.energy += power * dt
         self.distance += speed * dt
         if not self._rows or self.distance - self._rows[-1][0] > 100:

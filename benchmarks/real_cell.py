@@ -38,7 +38,7 @@ from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
 
 TEMPERATURES = (25, 10, 0, -10, -20)
-OFFSET = 0.05  # A of the cell: what the current sensor shows too much
+OFFSET = 0.05  # A of the cell: error of the current sensor
 TESTER_OFFSET = 0.005  # A: sd of the tester's own current, of which the reference is made
 WRONG = -0.2  # of SOC
 AS_NEW = 0.99  # the cell is the one that the tables were measured on
@@ -47,7 +47,7 @@ CONVERGED = 0.025  # of SOC: from here on the error counts
 NEAR = 0.03  # of SOC: a wrong start is left when it is first as near as this
 INTERVAL = 1.96  # sd: of 95 %
 NOMINAL = 2.9  # A·h, for C-rates
-SEED = 1  # of what is drawn
+SEED = 1  # of the drawn cases
 SENSOR = {"pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
 COLUMNS = {
     "time": Named("t_s", "s"),
@@ -59,7 +59,7 @@ COLUMNS = {
 
 
 class Case(NamedTuple):
-    """What the filter is told wrong: SOC, offset [A] and relative error of the current; and the sd it is told."""
+    """Errors given to the filter: SOC, offset [A] and relative error of the current; and the declared sd."""
 
     wrong: float = 0.0
     offset: float = 0.0
@@ -75,7 +75,7 @@ DRAWN = {"right": RIGHT_SD, "wrong": -WRONG}
 
 
 def drawn(work: Sequence[Cycle], capacity: Found) -> dict[tuple[str, Cycle], Case]:
-    """Cases whose errors are drawn from what the filter is told of them; a full cell is never told to be fuller.
+    """Cases with errors drawn from the declared uncertainty; a full cell never starts fuller.
 
     In the others the start, the count and the capacity are right, which no interval can know.
     """
@@ -92,9 +92,9 @@ def drawn(work: Sequence[Cycle], capacity: Found) -> dict[tuple[str, Cycle], Cas
 
 
 def pulse_test(folder: Path, temperature: int) -> Measurements:
-    """The pulses, with the discharge and the rest between them, which stand in a file of their own.
+    """Return the pulses with the discharge and rest between them, which are in a separate file.
 
-    That one has a clock of its own: its first rest ends where the pulses go on.
+    That file has a separate clock: its first rest ends where the pulses continue.
     """
     main = read_table(folder / f"{temperature}C_hppc.parquet", COLUMNS)
     between = read_table(folder / f"{temperature}C_hppc_between_pulses.parquet", COLUMNS)
@@ -129,7 +129,7 @@ class Cycle:
 
 
 def cycles(folder: Path) -> list[Cycle]:
-    """The drive cycles, cut where the cell is emptiest: some go on with the charge after it."""
+    """Return the drive cycles, cut where the cell is emptiest: some continue with a charge."""
     found = []
     for temperature in TEMPERATURES:
         for file in sorted(folder.glob(f"drive1hz_{temperature}C_*.csv.gz")):
@@ -256,7 +256,7 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
 
 
 def run(setting: Setting, cycle: Cycle, case: Case) -> Score:
-    """One cycle through the on-board estimator, which is told the SOC as of the `case` after its first step."""
+    """Run one cycle through the on-board estimator, whose SOC is set by `case` after its first step."""
     estimator = estimator_of(setting, case.declared)
     current = (1 + case.gain) * cycle.current + case.offset
     truth = 1 - cycle.drawn / setting.battery.cell_capacity(cycle.temperature)
@@ -490,7 +490,7 @@ MARK = "<!-- made by benchmarks/real_cell.py from here on -->"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("data", type=Path, help="folder of the cell's files")
-    parser.add_argument("--write", type=Path, help="replace what stands in this file after its mark")
+    parser.add_argument("--write", type=Path, help="replace everything after the mark in this file")
     parser.add_argument("--only", default="", help="cycles whose name holds this")
     parser.add_argument("--board", action="store_true", help="the filter on board alone")
     arguments = parser.parse_args()

@@ -2,8 +2,8 @@
 
     python benchmarks/stand_in.py RECEIVE_PORT SEND_PORT MODULE ARGUMENT...
 
-Only how the socket is made and bound is replaced, ours or python-can's. What the program then does with it is what it
-does on a real bus: `recvmsg` of 16-byte frames with the kernel's time stamps (SO_TIMESTAMPNS) and drop counter
+Only how the socket is made and bound is replaced, ours or python-can's. The program then works as
+on a real bus: `recvmsg` of 16-byte frames with the kernel's time stamps (SO_TIMESTAMPNS) and drop counter
 (SO_RXQ_OVFL), one queue in the kernel of the same bookkeeping, `send` of 16 bytes, `select`. What only AF_CAN knows
 (filters, loopback) is passed over: the frames sent here are all known to the vehicle.
 """
@@ -31,7 +31,7 @@ class StandIn(socket.socket):
 def install(receive_port: int, send_port: int, library: bool) -> None:
     """From now on a SocketCAN bus receives on one port of 127.0.0.1 and sends to the other; library: python-can's."""
     if library:
-        importlib.import_module("gz_onboard.can._can")  # python-can without what makes it large
+        importlib.import_module("gz_onboard.can._can")  # python-can without its large imports
         module = importlib.import_module("can.interfaces.socketcan.socketcan")
     else:
         module = importlib.import_module("gz_onboard.can.channel")

@@ -1,4 +1,4 @@
-"""The pictures of docs/how-to/find-losses.md: what the scooter's model lacks in bends, and what it is worth.
+"""Draw the pictures of docs/how-to/find-losses.md: the loss in bends that the model misses, and the gain of adding it.
 
 python -m benchmarks.turning_loss --output docs/images
 """
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def residual(found: Discovery, file: Path) -> None:
-    """Road force over lateral acceleration, before and after, with what the effect says."""
+    """Road force over lateral acceleration, before and after, with the effect."""
     cause = next(c for c in found.report.causes if c.name == "cornering_drag")
     before, after = before_and_after(found)
     figure = new_figure(11, 4.3)

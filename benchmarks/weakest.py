@@ -1,12 +1,13 @@
-"""What the weakest group of cells is worth: full discharges of the tests' plant, with and without one.
+"""Measure the gain from the weakest group of cells: full discharges of the tests' plant, with and without one.
 
     python -m benchmarks.weakest SEED...     # about 10 minutes for three seeds on one core
     python -m benchmarks.weakest SEED... --keep FOLDER    # the rides are kept there, and not ridden again
 
 Each seed is a scooter, a road, a rider and a day; it is ridden until the weakest group gives up, once for each pack of
 `PACKS`. The estimator hears the messages of battery, inverter and motor, from full, with nothing learned before; once
-with and once without the lowest cell's voltage. The errors are those of the energy left, over what was drawn until the
-end: the rider's share in the range is not the battery's. The plant's equations and sensors are not the package's.
+with and once without the lowest cell's voltage. The errors are those of the energy left, over the energy drawn
+until the end: the rider's share in the range is not the battery's. The plant's equations and sensors are separate from
+the package's.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def ride_all(seeds: Sequence[int]) -> dict[str, Columns]:
 
 
 def events(columns: Columns, lowest: Any = None) -> Iterator[Event]:
-    """What the bus says; `lowest`: makes another value of time [s] and value of the lowest cell's voltage, or None."""
+    """Return the signals of the bus. lowest: changes the lowest cell's voltage, from time [s] and value."""
     rows: list[Event] = []
     for index, group in enumerate(GROUPS):
         thin = slice(None, None, THINNED.get(group.roles[0], 1))
@@ -97,7 +98,7 @@ def estimates(columns: Columns, lowest: Any = None) -> tuple[list[Any], EventEst
 
 
 def errors(columns: Columns, made: Sequence[Any]) -> list[float]:
-    """Of the energy left at `LEVELS`, over what was drawn until the end."""
+    """Errors of the energy left at `LEVELS`, over the energy drawn until the end."""
     energy, soc = columns["true energy"], columns["true soc"]
     found = []
     for level in LEVELS:

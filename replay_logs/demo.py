@@ -1,7 +1,7 @@
-"""A full discharge with the range beside the truth, then what three rides hide: what `make run` shows.
+"""Show a full discharge with range and truth, then a hidden loss found in three rides (`make run`).
 
-All but the last seconds go through the daemon's pipeline as fast as it can. From what that knows the daemon continues
-on a CAN bus, onto which the last seconds are replayed in its own time. `discover` runs beside it. Where the kernel has
+All but the last seconds go through the daemon's pipeline as fast as possible. From its saved state the daemon continues
+on a CAN bus, where the last seconds are replayed in real time. `discover` runs in parallel. Where the kernel has
 no CAN, the part on the bus runs in a guest, which calls this file again with ``--live``.
 """
 
@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO, cast
 
 from cantools.database.can import Message
-from gz_onboard.lab.estimate_ride import How, OpenRide, ride_through
 
 from gz_onboard import cli, state
 from gz_onboard.can.channel import CanChannel
 from gz_onboard.display.view import View
+from gz_onboard.estimation.ride import OpenRide, RideOptions, run_ride
 from gz_onboard.events import Frame
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.recording.logs import read_frames, read_log
@@ -54,7 +54,7 @@ HEAD = "    battery    ridden    range, 80 % interval       true left    usual g
 
 
 class Row(NamedTuple):
-    """One moment of the ride: the battery in %, all else in km. usual: what the usual gauge shows."""
+    """One moment of the ride: battery in %, everything else in km. usual: the usual gauge."""
 
     battery: float
     ridden: float
@@ -71,7 +71,7 @@ class Row(NamedTuple):
 
 
 class Line:
-    """A line that is drawn anew, of which copies stay; where there is no terminal, only these are written."""
+    """A line that is redrawn, with copies that stay; without a terminal only these are written."""
 
     def __init__(self, ride: Path, out: TextIO, terminal: bool, kept: Sequence[int] = KEPT) -> None:
         self.rows: list[Row] = []
@@ -112,13 +112,13 @@ class Line:
         print("\r\x1b[K" * self._terminal + str(self.rows[-1]), file=self._out, flush=True)
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """Of the log that `ride_through` takes this for: not needed."""
+        """See `log_rows.Log`: not needed."""
 
     def frames(self, batch: Sequence[Frame]) -> None:
         """Likewise."""
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, Any], seen_ns: int | None = None) -> None:
-        """What is estimated, and what the vehicle says, once a second."""
+        """Draw the estimate and the vehicle's own figures once a second."""
         if topic == ESTIMATE_TOPIC:
             self.show(*(None if values[n] is None else values[n] * 1e-3 for n in ("range", "range_p10", "range_p90")))
         elif topic.removeprefix("/can/") in (ODOMETER.name, PACK.name):
@@ -197,7 +197,7 @@ def show_range(args: argparse.Namespace) -> list[Row]:
     print(
         f"""\
 gz_onboard tells the rider of an electric scooter how much farther it can go, from its CAN bus. From
-recorded rides it also finds what the model of the scooter gets wrong.
+recorded rides it also finds errors of the scooter's model.
 
 1  Range. {ridden:.1f} km recorded from full until the scooter cut out, so the true distance left is known.
     The usual gauge is the kilometres ridden per percent of battery used, times the percent left.
@@ -206,8 +206,8 @@ recorded rides it also finds what the model of the scooter gets wrong.
         flush=True,
     )
     live_ns = line.end_ns - round(args.seconds * 1e9)
-    ride = OpenRide(args.ride, VEHICLE, line.begin_ns, read_log(args.ride, None, live_ns), [])
-    estimator = ride_through(ride, How(signals=True), line).pipeline.estimator
+    ride = OpenRide(args.ride, VEHICLE, read_log(args.ride, None, live_ns), [])
+    estimator = run_ride(ride, RideOptions(signals=True), line).pipeline.estimator
     snapshot = estimator.snapshot(VEHICLE.key)
     assert snapshot, "nothing is known before the live part"
     state.write(state_file(args.output, VEHICLE.name), state.encode(snapshot, time.time()))
@@ -261,7 +261,7 @@ def live(args: argparse.Namespace) -> int:
 
 
 def watch(line: Line, interface: str, dashboard: list[str], replay: list[str]) -> None:
-    """Wait for the daemon, replay the ride, show what the daemon sends, and end it with the ride."""
+    """Wait for the daemon, replay the ride, show its range frames, and end it with the ride."""
     view = View(VEHICLE.publisher())
     identifiers = [*(view.identifiers or ()), ODOMETER.frame_id, PACK.frame_id]
     channel = CanChannel(interface, CHANNEL, identifiers=identifiers)
@@ -297,7 +297,7 @@ def free_port() -> int:
 
 
 def sentence(report: Mapping[str, Any]) -> str:
-    """What was found, in a sentence, and what it is good for in another."""
+    """State cause and gain of a discovery in two sentences."""
     if not report["causes"]:
         return f"    Found: {report['verdict']}."
     cause, gain = report["causes"][0], report["gain"]["range"]

@@ -49,7 +49,7 @@ SHELL = {
 def main() -> None:
     """Build it, and print where it is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="where the package is to be written")
+    parser.add_argument("folder", type=Path, help="folder for the package")
     parser.add_argument("--version", help="instead of the wheel's")
     parser.add_argument("--installed", action="store_true", help="other packages as in this environment: no network")
     args = parser.parse_args()
@@ -217,7 +217,7 @@ def stated(one: Distribution) -> str:
 
 
 def full_text(name: str, one: Distribution) -> str:
-    """All that the package has of texts of terms; what it lacks is in the folder licenses."""
+    """Return the license texts in the package; missing ones are in the folder licenses."""
     own = [path for path in one.files or () if ".dist-info" in path.parts[0]]
     named = re.compile(r"(?:LICEN[CS]E|COPYING|NOTICE)\S*", re.I)
     files = [path for path in own if named.fullmatch(path.name) or path.parts[1] == "licenses"]
