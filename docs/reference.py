@@ -21,18 +21,18 @@ from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.discovery.judgement import VERSION as DISCOVER_VERSION
 from gz_onboard.discovery.judgement import Report
 from gz_onboard.estimation.summary import KEYS, SUMMARY_VERSION
-from gz_onboard.lab import validate
 from gz_onboard.model.effect import QUANTITIES, VEHICLE_PARAMETERS, Parameter, package_effects
 from gz_onboard.model.parameters import BATTERY_PARAMETERS
 from gz_onboard.reports.results import descriptions
 from gz_onboard.simulation import summary as simulated
+from gz_onboard.validation import command as validation
 from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS: tuple[tuple[str, int, Mapping[str, str]], ...] = (
     ("estimate: a ride", SUMMARY_VERSION, KEYS),
     ("simulate", simulated.SUMMARY_VERSION, simulated.KEYS),
-    ("validate: a ride", validate.SUMMARY_VERSION, validate.KEYS),
+    ("validate: a ride", validation.SUMMARY_VERSION, validation.KEYS),
     ("calibrate", report.VERSION, report.KEYS),
     ("discover", DISCOVER_VERSION, descriptions(Report)),
     ("vehicle check: a log", CHECK_VERSION, descriptions(Checked)),

@@ -30,7 +30,7 @@ COMMANDS = {
     ),
     "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
     "validate": (
-        "gz_onboard.lab.validate",
+        "gz_onboard.validation.command",
         "compare recorded rides with their simulation: within 20 %, components within 10 %",
     ),
     "calibrate": ("gz_onboard.calibration.command", "determine a vehicle's parameters from measurements"),

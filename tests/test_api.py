@@ -154,7 +154,7 @@ def test_a_validation_is_that_of_the_command(capsys):
         for name, value in told[form]["channels"][channel].items():
             assert table[name][i] == value, (form, channel, name)
     assert "coastdown.blf: not passed" in str(found)
-    assert found.markdown().startswith("### In short")
+    assert found.markdown().startswith("### Summary")
     with pytest.raises(gz.InputError, match="no ride is given"):
         gz.validate([])
 

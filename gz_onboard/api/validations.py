@@ -9,15 +9,14 @@ from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
 from gz_onboard.errors import InputError
-from gz_onboard.lab.validate import ride_text
-from gz_onboard.lab.validate_report import markdown
-from gz_onboard.lab.validate_ride import compare_ride
-from gz_onboard.lab.validate_score import ValidatedRide
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
 from gz_onboard.recording.logs import logs_among
 from gz_onboard.simulation.plan import vehicle_on
+from gz_onboard.validation.comparison import ValidatedRide
+from gz_onboard.validation.ride import compare_ride
+from gz_onboard.validation.tables import markdown, ride_text
 from gz_onboard.vehicle import Vehicle
 
 _ERRORS = ("unit", "percent", "limit_percent", "passed", "rms", "max", "mean_error", "of_spread")

@@ -18,7 +18,6 @@ from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.mixed_model import initial
 from gz_onboard.estimator.cells import Cell
-from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.model.functions import Mesh, PiecewiseLinear
 from gz_onboard.model.model import air_density
@@ -27,6 +26,7 @@ from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
 from gz_onboard.simulation.parts import FirstOrderPack, Rider
 from gz_onboard.simulation.scooter import STEP, Scooter
+from gz_onboard.validation.components import battery_voltage, components, losses, road_load
 from gz_onboard.vehicle import read_vehicle
 
 LOG = Path(__file__).resolve().parents[2] / "replay_logs" / "city_14C.blf"

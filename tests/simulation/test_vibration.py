@@ -14,8 +14,6 @@ import pytest
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
 from gz_onboard.discovery.grid import vibration as of_samples
-from gz_onboard.lab.validate_components import battery_voltage, road_load
-from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.model.effect import MOVING, load_effect
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.simulation.parts import Dynamometer, straight
@@ -24,6 +22,8 @@ from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS
 from gz_onboard.simulation.trace import Trace
+from gz_onboard.validation.components import battery_voltage, road_load
+from gz_onboard.validation.ride import per_second
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import LOGS, joined, without_cell_effects
 

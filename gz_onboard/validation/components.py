@@ -1,4 +1,4 @@
-"""Each component by itself, with what was measured at its inputs, so that an error of the whole can be traced.
+"""Each component alone, with its measured inputs, so that an error of the whole can be traced to one of them.
 
     battery voltage     from measured current and cell temperature
     inverter DC power   from measured motor current (torque), motor speed and motor temperature
@@ -13,12 +13,10 @@ times current less that, and the electric power of the rest is what the inverter
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
+from gz_onboard.arrays import Array
 from gz_onboard.model.battery import discharged
 from gz_onboard.model.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.model.model import air_density, drag_torque
@@ -36,53 +34,43 @@ from gz_onboard.offline.series import (
     total,
 )
 from gz_onboard.simulation.parts import Dynamometer
+from gz_onboard.validation.comparison import CHANNELS, CONFIG, Comparison, Quantity
 from gz_onboard.vehicle import Vehicle
-
-
-@dataclass(frozen=True)
-class Component:
-    """Measured and modelled, per second, shape (n,); `valid` where they can be compared."""
-
-    quantity: Quantity
-    measured: Array
-    modelled: Array
-    valid: Mask
 
 
 def components(
     vehicle: Vehicle, measured: Mapping[str, Array], soc: float | None, ambient: float, roller: Dynamometer | None
-) -> dict[str, Component]:
-    """Those whose inputs were measured.
+) -> dict[str, Comparison]:
+    """Compare each component whose inputs were measured.
 
     measured: by role, per second, all of one length, and ``acceleration``, ``grade``, ``yaw_rate``, ``braking``,
-    ``pack_power`` and the heats of `validate_ride.losses_per_second` where known. soc, ambient: at the start.
+    ``pack_power``, ``motor_heat``, ``idle_heat`` and ``inverter_heat`` [W] where known. soc, ambient: at the start.
     """
-    found: dict[str, Component] = {}
+    found: dict[str, Comparison] = {}
     has = measured.keys()
-    every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
         voltage = battery_voltage(vehicle, measured, soc)
-        found["battery_voltage"] = Component(CHANNELS["pack_voltage"], measured["pack_voltage"], voltage, every)
+        found["battery_voltage"] = Comparison.of(CHANNELS["pack_voltage"], measured["pack_voltage"], voltage)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
-        motor_temperature = measured.get("motor_temperature", np.full(len(speed), ambient))
-        copper, idle, inverter = losses(vehicle, current, speed, motor_temperature)
-        constant = vehicle.parameters["torque_constant"]
+        warm = measured.get("motor_temperature", np.full(len(speed), ambient))
+        copper, idle, inverter = losses(vehicle, current, speed, warm)
+        torque = vehicle.parameters["torque_constant"] * current
         if has >= {"inverter_voltage", "inverter_current"}:
             power = measured["inverter_voltage"] * measured["inverter_current"]
-            modelled = constant * current * speed + copper + inverter
-            found["inverter_power"] = Component(Quantity("W", "inverter DC power"), power, modelled, every)
+            modelled = torque * speed + copper + inverter
+            found["inverter_power"] = Comparison.of(Quantity("W", "inverter DC power"), power, modelled)
         if "motor_torque" in has:
-            found["motor_torque"] = Component(
-                CHANNELS["motor_torque"], measured["motor_torque"], constant * current, every
-            )
-        moving = (measured["speed"] > ROLLING) & (measured.get("braking", np.zeros(len(speed))) <= 0)
+            found["motor_torque"] = Comparison.of(CHANNELS["motor_torque"], measured["motor_torque"], torque)
         if "acceleration" in has and ("grade" in has or roller):
-            force = (constant * current - drag_torque(idle, speed)) / road_speed(1.0, vehicle.parameters)
+            force = (torque - drag_torque(idle, speed)) / road_speed(1.0, vehicle.parameters)
             needed = road_load(vehicle, measured, ambient, roller)
-            found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
-        warm = {"motor_heat": copper + idle, "idle_heat": idle, "inverter_heat": inverter} | dict(measured)
-        found |= _temperatures(vehicle, warm, soc, ambient)
+            rolling = measured["speed"] > CONFIG.road_load_speed_m_s
+            if "braking" in has:
+                rolling &= measured["braking"] <= 0
+            found["road_load"] = Comparison.of(Quantity("N", "road load"), force, needed, rolling)
+        heats = {"motor_heat": copper + idle, "idle_heat": idle, "inverter_heat": inverter}
+        found |= _temperatures(vehicle, heats | dict(measured), soc, ambient)
     return found
 
 
@@ -168,38 +156,30 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
 
 def _temperatures(
     vehicle: Vehicle, measured: Mapping[str, Array], soc: float | None, ambient: float
-) -> dict[str, Component]:
+) -> dict[str, Comparison]:
     """The cooling networks with the heat of the measured currents, the measured ambient temperature and speed.
 
     measured: with motor_heat, idle_heat (of it without current) and inverter_heat [W]. A roller's fan follows it.
     """
-    speed = np.abs(measured["speed"])
-    every = np.ones(len(speed), dtype=bool)
-    p, battery = vehicle.parameters, vehicle.battery
-    air = measured.get("ambient_temperature", np.full(len(every), ambient))
-    outside = air, speed, np.full(len(every), p["cooling_factor"])
-    found: dict[str, Component] = {}
-
-    def add(sensor: str, network: Network, heat: Array, *more: Array) -> None:
-        modelled = np.array(temperatures(network, 1.0, heat, *outside, *more))
-        found[sensor] = Component(CHANNELS[sensor], measured[sensor], modelled, every)
-
-    def start(sensor: str) -> float:
-        return float(measured[sensor][0])
-
-    if "motor_temperature" in measured:
-        heats = measured["motor_heat"], measured["idle_heat"]
-        warm = start("motor_temperature")
-        add("motor_temperature", MotorCooling(p, warm, warm), *heats)
-    if "inverter_temperature" in measured:
-        warm = start("inverter_temperature")
-        add("inverter_temperature", InverterCooling(p, warm, warm), measured["inverter_heat"])
+    p, battery, speed = vehicle.parameters, vehicle.battery, np.abs(measured["speed"])
+    air = measured.get("ambient_temperature", np.full(len(speed), ambient))
+    start = {name: float(measured[name][0]) for name in CHANNELS if name.endswith("_temperature") and name in measured}
+    networks: dict[str, tuple[Network, Array, tuple[Array, ...]]] = {}
+    if (warm := start.get("motor_temperature")) is not None:
+        heats = measured["motor_heat"], (measured["idle_heat"],)
+        networks["motor_temperature"] = MotorCooling(p, warm, warm), *heats
+    if (warm := start.get("inverter_temperature")) is not None:
+        networks["inverter_temperature"] = InverterCooling(p, warm, warm), measured["inverter_heat"], ()
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
-        levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
+        levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start["cell_temperature"])))
         rest = ocv_over(battery, levels, cells) * battery.cells_series
         delivered = measured.get("pack_power", measured["pack_voltage"] * current)
         generated = heat(rest, 0.0, current) - delivered + reversible_heat_over(battery, current, levels, cells)
-        pack = LumpedCooling(p, "pack", start("cell_temperature"))
-        add("cell_temperature", pack, generated)
+        networks["cell_temperature"] = LumpedCooling(p, "pack", start["cell_temperature"]), generated, ()
+    found = {}
+    for name, (network, power, more) in networks.items():
+        outside = air, speed, np.full(len(speed), p["cooling_factor"])
+        modelled = np.array(temperatures(network, 1.0, power, *outside, *more))
+        found[name] = Comparison.of(CHANNELS[name], measured[name], modelled)
     return found
