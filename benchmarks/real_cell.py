@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.calibration import ocv, pulse
-from gz_onboard.calibration.cell_circuit import Circuit, voltage
+from gz_onboard.calibration import pulse
+from gz_onboard.calibration.cell import open_circuit
+from gz_onboard.calibration.circuit import Circuit, voltage
 from gz_onboard.calibration.result import Found, Result
 from gz_onboard.calibration.table import Measurements, Named, read_table
 from gz_onboard.estimator.battery_filter import with_soc
@@ -351,9 +352,9 @@ def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
 
     only: of cycles whose name holds this; board: of the filter on board alone.
     """
-    rest = ocv.calibrate(read_table(folder / "25C_c20_ocv.parquet", COLUMNS))
+    rest = open_circuit(read_table(folder / "25C_c20_ocv.parquet", COLUMNS))
     tables = {t: pulse_test(folder, t) for t in TEMPERATURES}
-    result = pulse.calibrate(list(tables.values()), rest.curves["battery.ocv"], rest.parameters["cell_capacity"])
+    result = pulse.calibrate_cell(list(tables.values()), rest.curves["battery.ocv"], rest.parameters["cell_capacity"])
     every = settings(rest, result)[: 1 if board else None]
     work = [c for c in cycles(folder) if only in c.name]
     plain = [c for c in work if "trise" not in c.name]

@@ -18,12 +18,7 @@ import numpy as np
 from tests.calibration import test_cooling, test_pulse
 from tests.calibration.cells import MANY, SLOW
 
-CELLS = {
-    "direct, one pair": ("direct", ((0.03, 30.0),)),
-    "reduced, one pair": ("reduced", ((0.03, 30.0),)),
-    "reduced, four pairs": ("reduced", MANY),
-    "reduced, strong slow pair": ("reduced", SLOW),
-}
+CELLS = {"one pair": ((0.03, 30.0),), "four pairs": MANY, "strong slow pair": SLOW}
 SCATTER = 0.03
 
 
@@ -40,8 +35,8 @@ def main() -> None:
         def counted(what: str, away: Callable[[int], dict[str, Any]], count: int) -> None:
             tell(what, list(pool.map(away, range(given.first, given.first + count))))
 
-        for what, (method, pairs) in CELLS.items():
-            counted(what, partial(test_pulse.away, method=method, pairs=pairs, scatter=SCATTER), given.cells)
+        for what, pairs in CELLS.items():
+            counted(what, partial(test_pulse.away, pairs=pairs, scatter=SCATTER), given.cells)
         for procedure in test_cooling.UNTOLD:
             counted(procedure.__name__, partial(test_cooling.away, procedure), given.networks)
 

@@ -11,30 +11,25 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.calibration import (
     auxiliary,
+    cell,
     cooling,
     cooling_run,
     losses,
     motor,
-    ocv,
     offsets,
     pulse,
     resistance,
     wheel,
 )
 from gz_onboard.calibration import coastdown as coasting
-from gz_onboard.calibration.cell_data import cell_test
 from gz_onboard.calibration.coastdown_run import samples as coastdown_samples
-from gz_onboard.calibration.fit import score
 from gz_onboard.calibration.manifest import Option, Slot
-from gz_onboard.calibration.pulse_error import slow_pair
-from gz_onboard.calibration.result import Curve, Found, Result, compared
+from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples, ride_name
 from gz_onboard.offline.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
-
-ABOVE_CUTOFF = 0.2  # V: at C/8 or slower a nearly empty cell is that near its open-circuit voltage
 
 
 @dataclass
@@ -70,14 +65,7 @@ class Procedure:
 
 
 def _ocv(given: Given) -> Result:
-    result = ocv.calibrate(given.tables["data"][0])
-    cutoff, empty = given.vehicle.parameters["cell_cutoff_voltage"], float(result.curves["battery.ocv"].value[0])
-    if empty > cutoff + ABOVE_CUTOFF:
-        result.refusals.append(
-            f"the discharge ends at an open-circuit voltage of {empty:.2f} V, {empty - cutoff:.2f} V above "
-            f"cell_cutoff_voltage ({cutoff:g} V): what the cell holds in between is not in its capacity"
-        )
-    return result
+    return cell.open_circuit(given.tables["data"][0], given.vehicle.parameters["cell_cutoff_voltage"])
 
 
 def _motor(given: Given) -> Result:
@@ -100,31 +88,10 @@ def _losses(given: Given) -> Result:
     return result
 
 
-THESIS_VOLTS = 0.02  # V: what Lord 2016 gives for a cell on a road profile
-
-
 def _pulse(given: Given) -> Result:
-    curve, capacity = _open_circuit(given)
     loads = [_load(ride) for ride in _true(given, "load")]
-    method = str(given.options["method"])
-    result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None, method=method)
-    cell, squares = pulse.circuit(result), []
-    for table in given.tables.get("held_out", []):
-        test = cell_test(table)
-        model, measured = pulse.follow_profile(cell, test)
-        result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
-        near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
-        result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
-        slow = slow_pair(test.flowed, test.dt, measured - model)
-        result.notes.append(f"{table.file.name}: {slow.words()}")
-        squares.append(float(np.mean((model - measured)[test.drawn < 0.9 * capacity.value] ** 2)))
-        title = f"{table.file.name}, held out"
-        result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)
-    error, held_out = result.parameters["cell_voltage_error"], float(np.sqrt(np.mean(squares or [0.0])))
-    if held_out > error.sd:  # what no fit has seen tells better than what it was made of
-        source = f"{', '.join(table.file.name for table in given.tables['held_out'])}: rms, held out"
-        result.parameters["cell_voltage_error"] = replace(error, sd=held_out, source=source)
-    return result
+    tables, held_out = given.tables["data"], given.tables.get("held_out", [])
+    return pulse.calibrate_cell(tables, *_open_circuit(given), loads=loads or None, held_out=held_out)
 
 
 def _open_circuit(given: Given) -> tuple[Curve, Found]:
@@ -245,7 +212,6 @@ PROCEDURES: dict[str, Procedure] = {
             "load": Slot("ride", "rides whose current the cell is to follow", 0),
         },
         _pulse,
-        {"method": "reduced"},
     ),
     "auxiliary": Procedure(
         "power of lamps, dashboard and control",

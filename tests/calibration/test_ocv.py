@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.calibration import ocv
+from gz_onboard.calibration.cell import OCV_SOC, open_circuit
 from gz_onboard.calibration.table import read_table
 from gz_onboard.errors import InputError
 from tests.calibration.cells import slow_test
@@ -23,7 +23,7 @@ NEEDS_DATA = pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA is not set")
 @settings(max_examples=15, deadline=None)
 def test_both_branches_give_curve_and_capacity_whatever_resistance_and_hysteresis(capacity, r0, hysteresis, seed):
     table, cell = slow_test(capacity=capacity, r0=r0, hysteresis=hysteresis, seed=seed)
-    result = ocv.calibrate(table)
+    result = open_circuit(table)
     curve, found = result.curves["battery.ocv"], result.parameters["cell_capacity"]
     assert abs(found.value - capacity) < 2 * found.sd
     soc, inside = curve.axes["soc"], (curve.axes["soc"] > 0.05) & (curve.axes["soc"] < 1)
@@ -39,18 +39,18 @@ def test_a_reversed_sign_is_refused_whether_the_steps_show_it_or_not(r0):
     table.columns["current"] *= -1
     how = "goes from .* discharging" if r0 > 0.01 else "as charge is drawn, .* discharging"
     with pytest.raises(InputError, match=f"ocv.csv.*{how} must be positive"):
-        ocv.calibrate(table)
+        open_circuit(table)
 
 
 def test_hysteresis_is_in_the_sd():
-    little, much = (ocv.calibrate(slow_test(hysteresis=h)[0]).curves["battery.ocv"].sd for h in (0.0, 0.02))
-    middle = (ocv.SOC > 0.2) & (ocv.SOC < 0.8)
+    little, much = (open_circuit(slow_test(hysteresis=h)[0]).curves["battery.ocv"].sd for h in (0.0, 0.02))
+    middle = (OCV_SOC > 0.2) & (OCV_SOC < 0.8)
     assert np.median(much[middle]) > np.median(little[middle]) + 0.006
 
 
 def test_without_a_charge_branch_the_discharge_is_moved_and_it_is_said():
     table, cell = slow_test(charge=0)
-    result = ocv.calibrate(table)
+    result = open_circuit(table)
     assert "no charge branch" in result.refusals[0]
     curve = result.curves["battery.ocv"]
     middle = (curve.axes["soc"] > 0.1) & (curve.axes["soc"] < 0.9)
@@ -60,10 +60,10 @@ def test_without_a_charge_branch_the_discharge_is_moved_and_it_is_said():
 
 
 def test_a_charge_that_stops_early_is_used_as_far_as_it_goes():
-    result = ocv.calibrate(slow_test(charge=0.5)[0])
+    result = open_circuit(slow_test(charge=0.5)[0])
     assert "SOC 0.5 to 0.99" in result.refusals[0].replace("0.55", "0.5")
     sd = result.curves["battery.ocv"].sd
-    assert np.median(sd[ocv.SOC > 0.6]) > np.median(sd[(ocv.SOC > 0.1) & (ocv.SOC < 0.4)])
+    assert np.median(sd[OCV_SOC > 0.6]) > np.median(sd[(OCV_SOC > 0.1) & (OCV_SOC < 0.4)])
 
 
 def test_branches_that_do_not_close_are_not_averaged():
@@ -71,10 +71,10 @@ def test_branches_that_do_not_close_are_not_averaged():
     up = table.columns["current"] < 0
     volts = table.columns["voltage"].copy()
     volts[up] += np.linspace(0.0, table.columns["voltage"][0] - volts[up][-1], np.count_nonzero(up))
-    result = ocv.calibrate(replace(table, columns={**table.columns, "voltage": volts}))
+    result = open_circuit(replace(table, columns={**table.columns, "voltage": volts}))
     assert "do not close" in result.refusals[0]
-    middle = (ocv.SOC > 0.1) & (ocv.SOC < 0.9)
-    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(ocv.SOC))[middle].max() < 0.006
+    middle = (OCV_SOC > 0.1) & (OCV_SOC < 0.9)
+    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(OCV_SOC))[middle].max() < 0.006
 
 
 def changed(**columns):
@@ -102,21 +102,21 @@ def put(index, value):
 )
 def test_what_is_no_slow_test_is_refused(table, words):
     with pytest.raises(InputError, match=words):
-        ocv.calibrate(table)
+        open_circuit(table)
 
 
 def test_a_missing_column_and_too_few_samples_are_named():
     table = slow_test()[0]
     without = {k: v for k, v in table.columns.items() if k != "voltage"}
     with pytest.raises(InputError, match=r"ocv\.csv: no column for 'voltage'"):
-        ocv.calibrate(replace(table, columns=without))
+        open_circuit(replace(table, columns=without))
     with pytest.raises(InputError, match="20 samples are too few"):
-        ocv.calibrate(replace(table, columns={k: v[:20] for k, v in table.columns.items()}))
+        open_circuit(replace(table, columns={k: v[:20] for k, v in table.columns.items()}))
 
 
 @NEEDS_DATA
 def test_the_bench_cell():
-    result = ocv.calibrate(read_table(Path(str(DATA)) / "bench/cell_ocv_25C.csv.gz"))
+    result = open_circuit(read_table(Path(str(DATA)) / "bench/cell_ocv_25C.csv.gz"))
     assert abs(result.parameters["cell_capacity"].value - 2.734) < 0.003
     curve = result.curves["battery.ocv"]
     assert np.all(np.diff(curve.value) > 0)

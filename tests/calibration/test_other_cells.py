@@ -9,7 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gz_onboard.calibration import ocv, pulse
+from gz_onboard.calibration import cell as bench
+from gz_onboard.calibration import pulse
 from gz_onboard.calibration.command import for_file
 from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
@@ -55,7 +56,7 @@ def test_a_flat_curve_still_increases_when_rounded(tmp_path, knee):
     table = flat_test()
     rest = len(table) - 1 - int(np.argmax(table["current"][::-1] > 0)) + 1
     table["voltage"][rest : rest + 61] += knee  # the cell rests far above the lowest voltages of its discharge
-    result = ocv.calibrate(table)
+    result = bench.open_circuit(table)
     assert np.all(np.diff(written(tmp_path, result).pack.ocv_curve.y) >= 1e-5)
     notes = " ".join(result.notes)
     assert "(585 mΩ within minutes) would make 146" in notes
@@ -64,14 +65,14 @@ def test_a_flat_curve_still_increases_when_rounded(tmp_path, knee):
 
 
 def test_branches_that_lie_upon_each_other_are_known_within_what_a_file_holds(tmp_path):
-    result = ocv.calibrate(slow_test(r0=1e-4, noise=1e-5, pairs=())[0])
+    result = bench.open_circuit(slow_test(r0=1e-4, noise=1e-5, pairs=())[0])
     assert written(tmp_path, result).pack.ocv_sd >= 5e-4
 
 
 def test_one_pulse_test_of_a_cell_without_relaxation(tmp_path):
-    slow = ocv.calibrate(slow_test()[0])
+    slow = bench.open_circuit(slow_test()[0])
     table, _ = pulse_test(25.0, 5, pairs=(), noise=1e-5)
-    found = pulse.calibrate([table], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
+    found = pulse.calibrate_cell([table], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
     battery = written(tmp_path, slow, found).pack
     assert battery.cell_capacity(-20) == battery.cell_capacity(25)
 
@@ -81,7 +82,7 @@ def test_a_shift_of_another_cell_goes_with_its_curve(tmp_path):
     base = tmp_path / "base.toml"
     write_vehicle(REFERENCE, [Result("t", curves={"battery.rest_shift": shift})], base)
     assert read_vehicle(base).pack.rest_shift_curve
-    write_vehicle(base, for_file([ocv.calibrate(slow_test()[0])], read_vehicle(base)), base)
+    write_vehicle(base, for_file([bench.open_circuit(slow_test()[0])], read_vehicle(base)), base)
     assert not read_vehicle(base).pack.rest_shift_curve
 
 
@@ -91,8 +92,8 @@ FALLING = Curve({"soc": np.linspace(0, 1, 3)}, np.array([3.0, 3.14196, 3.141961]
 def test_a_file_that_could_not_be_read_leaves_the_old_one_and_a_report(tmp_path, monkeypatch, capsys):
     out, page = tmp_path / "v.toml", tmp_path / "r.html"
     out.write_text("the old one")
-    good = ocv.calibrate
-    monkeypatch.setattr(ocv, "calibrate", lambda table: replace(good(table), curves={"battery.ocv": FALLING}))
+    good = bench.open_circuit
+    monkeypatch.setattr(bench, "open_circuit", lambda *given: replace(good(*given), curves={"battery.ocv": FALLING}))
     file = as_csv(slow_test()[0], tmp_path / "ocv.csv")
     assert main(["calibrate", "ocv", file, "--output", str(out), "--report", str(page), "--quiet"]) == 2
     said = capsys.readouterr()
@@ -130,14 +131,14 @@ def test_a_step_that_fails_leaves_the_report_of_those_before(tmp_path, capsys):
 
 
 def test_a_value_out_of_bounds_is_named(tmp_path, monkeypatch, capsys):
-    good = ocv.calibrate
+    good = bench.open_circuit
 
-    def tiny(table):
-        result = good(table)
+    def tiny(table, cutoff):
+        result = good(table, cutoff)
         result.parameters["cell_capacity"] = Found(0.05, 0.001, "A·h", "coin")
         return result
 
-    monkeypatch.setattr(ocv, "calibrate", tiny)
+    monkeypatch.setattr(bench, "open_circuit", tiny)
     file, page = as_csv(slow_test()[0], tmp_path / "ocv.csv"), tmp_path / "r.html"
     assert main(["calibrate", "ocv", file, "--output", str(tmp_path / "v.toml"), "--report", str(page)]) == 2
     assert "cell_capacity: 0.05 A·h was found, outside 0.1 to 1000 A·h" in capsys.readouterr().err
@@ -154,35 +155,35 @@ def counted(share, **plant):
 @pytest.mark.parametrize("share", [0.94, 1.068])
 def test_branches_of_different_charge_are_each_by_their_own_and_it_is_said(share):
     table, cell = counted(share, hysteresis=0.005)
-    result = ocv.calibrate(table)
+    result = bench.open_circuit(table)
     curve, capacity = result.curves["battery.ocv"], result.parameters["cell_capacity"]
     assert capacity.value == pytest.approx(cell.capacity, rel=1e-3)
     assert capacity.sd > 0.9 * abs(1 - share) * cell.capacity
-    inside = (ocv.SOC > 0.1) & (ocv.SOC < 1)
-    assert np.abs(curve.value - cell.ocv(ocv.SOC))[inside].max() < 0.004
+    inside = (bench.OCV_SOC > 0.1) & (bench.OCV_SOC < 1)
+    assert np.abs(curve.value - cell.ocv(bench.OCV_SOC))[inside].max() < 0.004
     assert f"brings back {share * cell.capacity:.3f} of {cell.capacity:.3f} A·h" in " ".join(result.refusals)
 
 
 def test_a_charge_that_no_cell_takes_is_refused():
     with pytest.raises(InputError, match=r"ocv.csv: the charge brings back 3.\d+ of 2.500 A·h.*10 %"):
-        ocv.calibrate(counted(1.25)[0])
+        bench.open_circuit(counted(1.25)[0])
 
 
 def test_a_fast_charge_is_not_averaged_with_a_slow_discharge():
     cell = Plant()
     pieces = [(0, 600, 60), (0.125, 72000, 60), (0, 3600, 60), (-1.25, 7200, 60), (0, 600, 60)]
-    result = ocv.calibrate(cell.run(pieces, name="ocv.csv"))
+    result = bench.open_circuit(cell.run(pieces, name="ocv.csv"))
     assert "1.25 A" in result.refusals[0]
-    middle = (ocv.SOC > 0.1) & (ocv.SOC < 0.9)
-    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(ocv.SOC))[middle].max() < 0.006
+    middle = (bench.OCV_SOC > 0.1) & (bench.OCV_SOC < 0.9)
+    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(bench.OCV_SOC))[middle].max() < 0.006
 
 
 def test_a_charge_before_the_discharge_is_a_branch_too():
     cell = Plant(soc=0.0, hysteresis=0.005)
     pieces = [(0, 600, 60), (-0.125, 72000, 60), (0, 3600, 60), (0.125, 72000, 60), (0, 3600, 60)]
-    result = ocv.calibrate(cell.run(pieces, name="ocv.csv"))
-    inside = (ocv.SOC > 0.05) & (ocv.SOC < 1)
-    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(ocv.SOC))[inside].max() < 0.003
+    result = bench.open_circuit(cell.run(pieces, name="ocv.csv"))
+    inside = (bench.OCV_SOC > 0.05) & (bench.OCV_SOC < 1)
+    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(bench.OCV_SOC))[inside].max() < 0.003
     assert not result.refusals
 
 
@@ -192,31 +193,31 @@ def test_without_a_rest_before_the_discharge_full_is_not_its_first_voltage(befor
     table = cell.run([*before, (0.125, 72000, 60), (0, 3600, 60), (-0.125, 72000, 60), (0, 600, 60)], name="ocv.csv")
     if not before:
         table = replace(table, columns={name: column[2:] for name, column in table.columns.items()})
-    result = ocv.calibrate(table)
+    result = bench.open_circuit(table)
     curve = result.curves["battery.ocv"]
     assert re.search(r"ocv.csv: no rest before the discharge .* moved by", result.refusals[-1])
     assert abs(curve.value[-1] - cell.ocv(1.0)) < min(curve.sd[-1], 0.012)
 
 
 def test_a_pulse_test_that_begins_under_load_is_refused():
-    slow = ocv.calibrate(slow_test()[0])
+    slow = bench.open_circuit(slow_test()[0])
     table, _ = pulse_test(25.0, 5)
     begin = int(np.argmax(table["current"] > 0)) + 2
     loaded = replace(table, columns={name: column[begin:] for name, column in table.columns.items()})
     with pytest.raises(InputError, match=r"begins under a current of 1 A.*at rest"):
-        pulse.calibrate([loaded], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
+        pulse.calibrate_cell([loaded], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
 
 
 @cache
 def slow():
-    result = ocv.calibrate(slow_test()[0])
+    result = bench.open_circuit(slow_test()[0])
     return result.curves["battery.ocv"], result.parameters["cell_capacity"]
 
 
 def test_pulses_on_a_flat_curve_take_the_capacity_of_the_slow_test(tmp_path):
-    flat = ocv.calibrate(flat_test())
+    flat = bench.open_circuit(flat_test())
     table = Flat(hysteresis=0.02).run(pulse_pieces(levels=6), name="flat.csv")
-    found = pulse.calibrate([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
+    found = pulse.calibrate_cell([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
     assert "do not tell the capacity" in " ".join(found.refusals)
     assert found.curves["battery.capacity"].value[0] == pytest.approx(2.5, rel=0.02)
     assert found.curves["battery.capacity"].sd[0] > 0.1
@@ -227,16 +228,16 @@ def test_pulses_on_a_flat_curve_take_the_capacity_of_the_slow_test(tmp_path):
 
 def test_pulses_of_another_capacity_than_the_slow_test_are_told():
     curve, capacity = slow()
-    found = pulse.calibrate([pulse_test(25.0, 6)[0]], curve, replace(capacity, value=2.7))
+    found = pulse.calibrate_cell([pulse_test(25.0, 6)[0]], curve, replace(capacity, value=2.7))
     assert re.search(r"pulse_25C.csv: .* 2.5\d+ A·h at 25 degC, cell_capacity is 2.700", " ".join(found.notes))
-    assert "cell_capacity" not in " ".join(pulse.calibrate([pulse_test(25.0, 6)[0]], *slow()).notes)
+    assert "cell_capacity" not in " ".join(pulse.calibrate_cell([pulse_test(25.0, 6)[0]], *slow()).notes)
 
 
 def test_meshes_of_few_pulses_are_not_compared():
     pieces: list[tuple[float, float, float]] = [(0, 1500, 10)]
     for seconds in (6550, 150, 150):  # to 9, 7 and 5 % of charge
         pieces += [(1.25, seconds / 2, 5), (0, 60, 5), (1.25, seconds / 2, 5), (0, 1500, 10)]
-    found = pulse.calibrate([Plant().run(pieces, name="few.csv")], *slow())
+    found = pulse.calibrate_cell([Plant().run(pieces, name="few.csv")], *slow())
     assert "mesh" not in " ".join(f.what for f in found.fits)
     assert "meshes" in " ".join(found.refusals)
 
@@ -256,27 +257,27 @@ def test_a_wrong_unit_is_named(column, factor, more, words):
     table = replace(table, file=table.file.with_name("cell.csv"))
     table.columns[column] = table.columns[column] * factor + more
     with pytest.raises(InputError, match=words):
-        pulse.calibrate([table], *slow())
+        pulse.calibrate_cell([table], *slow())
 
 
 def test_a_lost_sample_is_named_with_its_line():
     table, _ = slow_test()
     table["voltage"][500] = 0.0
     with pytest.raises(InputError, match=r"ocv.csv:501: voltage is 0 V"):
-        ocv.calibrate(table)
+        bench.open_circuit(table)
 
 
 def test_pulses_that_begin_on_a_flat_part_are_refused():
-    flat = ocv.calibrate(flat_test())
+    flat = bench.open_circuit(flat_test())
     table = Flat(soc=0.8, hysteresis=0.02).run(pulse_pieces(levels=6)[:71], name="flat.csv")
     with pytest.raises(InputError, match=r"flat.csv: begins at 3.3.. V, .* flat.* begin full"):
-        pulse.calibrate([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
+        pulse.calibrate_cell([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
 
 
 def test_a_short_pause_does_not_end_a_discharge():
     cell = Plant()
     pieces = [(0, 600, 60), (0.125, 43200, 60), (0, 120, 60), (0.125, 28800, 60), (0, 3600, 60), (-0.125, 72000, 60)]
-    result = ocv.calibrate(cell.run([*pieces, (0, 600, 60)], name="ocv.csv"))
+    result = bench.open_circuit(cell.run([*pieces, (0, 600, 60)], name="ocv.csv"))
     assert result.parameters["cell_capacity"].value == pytest.approx(2.5, rel=1e-3)
     assert not result.refusals
     assert "mean of discharge and charge" in result.curves["battery.ocv"].source
@@ -285,13 +286,13 @@ def test_a_short_pause_does_not_end_a_discharge():
 def test_a_discharge_in_pieces_is_refused():
     pieces = [(0, 600, 60), (0.125, 43200, 60), (0, 3600, 60), (0.125, 28800, 60), (0, 3600, 60)]
     with pytest.raises(InputError, match=r"ocv.csv: 2.5\d* A·h are drawn in pieces.* 1.5\d* of it without a pause"):
-        ocv.calibrate(Plant().run(pieces, name="ocv.csv"))
+        bench.open_circuit(Plant().run(pieces, name="ocv.csv"))
 
 
 def test_the_source_says_when_there_is_no_charge():
-    source = ocv.calibrate(slow_test(charge=0)[0]).curves["battery.ocv"].source
+    source = bench.open_circuit(slow_test(charge=0)[0]).curves["battery.ocv"].source
     assert source.endswith("; discharge moved by its resistance")
 
 
 def test_one_node_without_a_charge_is_no_range():
-    assert "no charge branch at SOC 0.99 (it brings" in ocv.calibrate(slow_test(charge=0.985)[0]).refusals[0]
+    assert "no charge branch at SOC 0.99 (it brings" in bench.open_circuit(slow_test(charge=0.985)[0]).refusals[0]

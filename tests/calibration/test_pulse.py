@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gz_onboard.calibration import ocv, pulse
-from gz_onboard.calibration.cell_circuit import riding_current, voltage
-from gz_onboard.calibration.cell_data import cell_test
-from gz_onboard.calibration.cell_fit import TIMES, Reduction
+from gz_onboard.calibration import pulse
+from gz_onboard.calibration.cell import cell_test, open_circuit
+from gz_onboard.calibration.circuit import TIMES, Reduction, follow_profile, riding_current, voltage
 from gz_onboard.calibration.result import Found
 from gz_onboard.calibration.table import Measurements, read_table
 from gz_onboard.errors import InputError
@@ -24,14 +23,14 @@ INSIDE = (pulse.SOC > 0.12) & (pulse.SOC < 0.95)
 
 @cache
 def slow():
-    result = ocv.calibrate(slow_test()[0])
+    result = open_circuit(slow_test()[0])
     return result.curves["battery.ocv"], result.parameters["cell_capacity"]
 
 
 @cache
 def found(seed=0, pairs=((0.03, 30.0),), temperatures=(0.0, 25.0), levels=10):
     tables = [pulse_test(t, levels, seed=seed + k, pairs=pairs)[0] for k, t in enumerate(temperatures)]
-    return pulse.calibrate(tables, *slow())
+    return pulse.calibrate_cell(tables, *slow())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -47,7 +46,7 @@ def test_what_was_planted_comes_back_within_its_uncertainty(seed):
     assert list(result.curves["battery.r0"].axes["temperature"]) == [0, 25]
 
 
-def away(seed, method, pairs=((0.03, 30.0),), scatter=0.03):
+def away(seed, pairs=((0.03, 30.0),), scatter=0.03):
     """How far R0, R1, C1 are from the truth in their own sd, each (2, nodes), of a cell measured by a tester whose
     current reads 0.5 % wrong (1 sd) and whose resistances and times scatter from pulse to pulse."""
     cold, gain = np.exp([[1.0], [0.0]]), 0.005 * float(np.random.default_rng(seed).normal())
@@ -55,7 +54,7 @@ def away(seed, method, pairs=((0.03, 30.0),), scatter=0.03):
         pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=scatter, pairs=pairs)[0]
         for k, t in enumerate((0.0, 25.0))
     ]
-    result = pulse.calibrate(tables, *slow(), method=method)
+    result = pulse.calibrate_cell(tables, *slow())
     loads = [riding_current(seed=k) for k in range(1, 4)]
     given = (
         [tuple(result.parameters[name].value for name in ("slow_resistance", "slow_time"))]
@@ -68,10 +67,9 @@ def away(seed, method, pairs=((0.03, 30.0),), scatter=0.03):
     return {name: ((found[name].value - x) / found[name].sd)[:, INSIDE] for name, x in truths.items()}
 
 
-@pytest.mark.parametrize(("method", "pairs"), [("direct", ((0.03, 30.0),)), ("reduced", MANY)])
-def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says(method, pairs):
+def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says():
     """Over seeds; a cell of many pairs is to give the one pair nearest to them, which other code finds."""
-    found = [away(seed, method, pairs) for seed in range(4)]
+    found = [away(seed, MANY) for seed in range(4)]
     held = {name: np.mean([np.abs(z[name]) < 1.96 for z in found]) for name in found[0]}
     assert all(share >= 0.9 for share in held.values()), held
     assert np.mean(list(held.values())) <= 0.99, held  # of few seeds; `python -m benchmarks.recovery` counts each
@@ -80,26 +78,15 @@ def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says(method, p
 def test_a_pair_between_two_of_the_times_comes_back():
     """Not from noise or scatter: what the distance of the fixed times costs."""
     tables = [pulse_test(t, seed=k, noise=1e-6)[0] for k, t in enumerate((0.0, 25.0))]
-    curves, cold = pulse.calibrate(tables, *slow()).curves, np.exp([[1.0], [0.0]])
+    curves, cold = pulse.calibrate_cell(tables, *slow()).curves, np.exp([[1.0], [0.0]])
     for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
         assert np.mean(curves[f"battery.{name}"].value / truth - 1, where=INSIDE) == pytest.approx(0, abs=0.015), name
-
-
-def test_the_direct_fit_gives_back_a_cell_that_has_one_pair():
-    tables = [pulse_test(t, seed=k)[0] for k, t in enumerate((0.0, 25.0))]
-    result = pulse.calibrate(tables, *slow(), method="direct")
-    cold = np.exp([[1.0], [0.0]])
-    for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
-        curve = result.curves[f"battery.{name}"]
-        error = (curve.value - truth)[:, INSIDE]
-        assert np.all(np.abs(error) < 0.04 * truth), name
-        assert np.mean(np.abs(error) < 1.96 * curve.sd[:, INSIDE]) > 0.9, name
 
 
 @cache
 def resting(rest, seed):
     """Of a cell whose rest voltage falls by `rest` [V/K] below 25 degC, and by what the tester's noise makes of it."""
-    return pulse.calibrate(
+    return pulse.calibrate_cell(
         [pulse_test(t, seed=seed + k, rest=rest)[0] for k, t in enumerate((-5.0, 10.0, 25.0))], *slow()
     )
 
@@ -122,11 +109,6 @@ def test_rests_that_do_not_are_not_said_to():
     assert pulse.circuit(result).rest_shift is None
 
 
-def test_an_unknown_method_is_named():
-    with pytest.raises(InputError, match="did you mean 'direct'"):
-        pulse.calibrate([pulse_test()[0]], *slow(), method="dirct")
-
-
 def test_tables_are_positive_and_marked_where_data_end():
     result = found()
     for name in ("battery.r0", "battery.r1", "battery.c1", "slow_resistance", "slow_time"):
@@ -145,7 +127,7 @@ def road(seed=9, pairs=((0.03, 30.0),)):
 
 
 def test_the_tables_follow_a_load_at_a_temperature_between_those_of_the_tests():
-    model, measured = pulse.follow_profile(pulse.circuit(found(temperatures=(15.0, 25.0))), road())
+    model, measured = follow_profile(pulse.circuit(found(temperatures=(15.0, 25.0))), road())
     assert np.sqrt(np.mean((model - measured) ** 2)) < 0.005
     assert np.sqrt(np.mean((model - model.mean() - measured + measured.mean()) ** 2)) < 0.1 * np.std(measured)
 
@@ -167,17 +149,6 @@ def test_a_cell_that_relaxes_fast_has_none():
     assert not result.effects["slow_relaxation"]
     assert "slow_resistance" not in result.parameters
     assert any("no slow relaxation" in note for note in result.notes)
-
-
-def test_slow_relaxation_is_followed_better_with_its_effect_than_by_one_pair():
-    result = found(pairs=SLOWLY, temperatures=(15.0, 25.0))
-    tables = [pulse_test(t, seed=k, pairs=SLOWLY)[0] for k, t in enumerate((15.0, 25.0))]
-    alone = pulse.calibrate(tables, *slow(), method="direct")
-    errors = []
-    for cell in (pulse.circuit(result), pulse.circuit(alone)):
-        model, measured = pulse.follow_profile(cell, road(pairs=SLOWLY))
-        errors.append(np.sqrt(np.mean((model - measured) ** 2)))
-    assert errors[0] < 0.6 * errors[1], errors
 
 
 @pytest.mark.parametrize("step", [1.0, 10.0])
@@ -202,13 +173,11 @@ def test_the_reduction_gives_back_a_pair_that_is_one_of_the_many():
     reduction = Reduction([riding_current(600)])
     many, place = np.zeros(1 + len(TIMES)), 5
     many[0], many[1 + place] = 0.05, 0.02
-    pairs = reduction(many)
-    assert pairs.r0 == pytest.approx(0.05, rel=0.01)
-    assert pairs.resistance[0] == pytest.approx(0.02, rel=0.02)
-    assert pairs.time[0] == pytest.approx(TIMES[place], rel=0.05)
-    scaled = reduction(3 * many)
-    assert scaled.r0 == pytest.approx(3 * pairs.r0)
-    assert scaled.time == pytest.approx(pairs.time)
+    r0, r1, time = np.exp(reduction.logs(many[:, None])[0])
+    assert r0 == pytest.approx(0.05, rel=0.01)
+    assert r1 == pytest.approx(0.02, rel=0.02)
+    assert time == pytest.approx(TIMES[place], rel=0.05)
+    assert np.exp(reduction.logs(3 * many[:, None])[0]) == pytest.approx([3 * r0, 3 * r1, time])
 
 
 def test_the_tester_s_counter_bridges_gaps():
@@ -223,8 +192,8 @@ def test_the_tester_s_counter_bridges_gaps():
         return replace(t, columns={k: v[keep] for k, v in t.columns.items()})
 
     with pytest.raises(InputError, match="what was drawn meanwhile is not known"):
-        pulse.calibrate([without(table)], *slow())
-    result = pulse.calibrate([without(counted)], *slow())
+        pulse.calibrate_cell([without(table)], *slow())
+    result = pulse.calibrate_cell([without(counted)], *slow())
     assert result.curves["battery.r0"].value[0, INSIDE] == pytest.approx(0.05, rel=0.03)
 
 
@@ -246,19 +215,19 @@ def changed(**columns):
 )
 def test_what_is_no_pulse_test_is_refused(tables, words):
     with pytest.raises(InputError, match=words):
-        pulse.calibrate(tables, *slow())
+        pulse.calibrate_cell(tables, *slow())
 
 
 def test_half_a_range_is_refused():
     curve = slow()[0]
     with pytest.raises(InputError, match="at least half of the range"):
-        pulse.calibrate([pulse_test()[0]], curve, Found(6.0, 0.1, "A·h", "another cell"))
+        pulse.calibrate_cell([pulse_test()[0]], curve, Found(6.0, 0.1, "A·h", "another cell"))
 
 
 def test_a_start_below_full_is_said():
     cell = Plant(soc=0.85)
     table = cell.run(pulse_pieces(2.0, 8), 25.0, "late.csv")
-    result = pulse.calibrate([table], *slow())
+    result = pulse.calibrate_cell([table], *slow())
     assert any("SOC 0.8" in note and "not full" in note for note in result.notes)
     assert result.curves["battery.r0"].value[0, 8] == pytest.approx(0.05, rel=0.03)
     assert any("0.05, 1 at 25 degC" in text for text in result.refusals)
@@ -267,13 +236,13 @@ def test_a_start_below_full_is_said():
 @NEEDS_DATA
 def test_the_bench_cell_on_road_profiles_that_were_not_fitted():
     folder = Path(str(DATA)) / "bench"
-    slow_result = ocv.calibrate(read_table(folder / "cell_ocv_25C.csv.gz"))
+    slow_result = open_circuit(read_table(folder / "cell_ocv_25C.csv.gz"))
     tables = [read_table(folder / f"cell_pulse_{t}C.csv.gz") for t in (-10, 0, 10, 25, 40)]
-    result = pulse.calibrate(tables, slow_result.curves["battery.ocv"], slow_result.parameters["cell_capacity"])
+    result = pulse.calibrate_cell(tables, slow_result.curves["battery.ocv"], slow_result.parameters["cell_capacity"])
     for name, limit_one, limit_two in (("25C", 0.0126, 0.007), ("5C", 0.0254, 0.0125)):
         profile = cell_test(read_table(folder / f"cell_road_profile_{name}.csv"))
         for two, limit in ((False, limit_one), (True, limit_two)):
-            model, measured = pulse.follow_profile(pulse.circuit(result, two), profile)
+            model, measured = follow_profile(pulse.circuit(result, two), profile)
             assert np.sqrt(np.mean((model - measured) ** 2)) < limit
     held_out = {f.what: f.r2 or 0.0 for f in result.fits if f.held_out}
     thesis = {"R0": 0.9976, "R1": 0.9210, "C1": 0.9600}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.pulse_error import Residual, slow_pair, voltage_errors
+from gz_onboard.calibration.pulse import Residual, voltage_errors
 from gz_onboard.calibration.result import Result
 
 
@@ -67,18 +67,3 @@ def test_load_counts_as_much_as_rest_though_a_test_has_little_of_it():
     result = Result("pulse")
     voltage_errors([Residual(-10.0, time, values, np.full(len(time), 0.5), rest)], "t", result)
     assert result.curves["battery.voltage_error"].value == pytest.approx([np.hypot(0.005, 0.04) / np.sqrt(2)])
-
-
-@pytest.mark.parametrize(("resistance", "time"), [(0.04, 2400.0), (0.0, 2400.0)])
-def test_a_pair_that_the_circuit_lacks_is_found(resistance, time):
-    rng = np.random.default_rng(5)
-    dt = np.full(3000, 1.0)
-    flowed = 1.5 + np.repeat(rng.normal(0, 2, 300), 10)
-    state = np.zeros(len(dt))
-    for k in range(1, len(dt)):
-        state[k] = state[k - 1] + dt[k] / time * (flowed[k] - state[k - 1])
-    found = slow_pair(flowed, dt, -resistance * state + rng.normal(0, 1e-3, len(dt)))
-    assert found.resistance / found.time == pytest.approx(resistance / time, abs=2e-6)
-    if resistance:
-        assert found.without > 0.02
-    assert found.largest < 0.006

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gz_onboard.calibration import pulse
-from gz_onboard.calibration.cell_circuit import NO_REACTION
-from gz_onboard.calibration.cell_data import cell_test
+from gz_onboard.calibration.cell import cell_test
+from gz_onboard.calibration.circuit import NO_REACTION, follow_profile
 from tests.calibration.cells import Plant, pulse_test
 from tests.calibration.test_pulse import slow
 
@@ -18,7 +18,7 @@ PLANTED = 0.015
 @cache
 def found(reaction):
     tests = [pulse_test(t, 6, seed=k, reaction=reaction)[0] for k, t in enumerate((-10.0, 10.0, 25.0))]
-    return pulse.calibrate(tests, *slow())
+    return pulse.calibrate_cell(tests, *slow())
 
 
 def test_it_is_found_with_its_temperature_and_time():
@@ -38,12 +38,12 @@ def test_a_load_that_no_fit_has_seen_is_followed_better_with_it(monkeypatch):
     assert cell.reaction.resistance > 0
 
     def left(circuit):
-        model, measured = pulse.follow_profile(circuit, ride)
+        model, measured = follow_profile(circuit, ride)
         return float(np.sqrt(np.mean((model - measured) ** 2)))
 
-    monkeypatch.setattr(pulse, "charge_transfer", lambda *_: NO_REACTION)
+    monkeypatch.setattr(pulse, "_charge_transfer", lambda *_: NO_REACTION)
     tests = [pulse_test(t, 6, seed=k, reaction=PLANTED)[0] for k, t in enumerate((-10.0, 10.0, 25.0))]
-    without = pulse.circuit(pulse.calibrate(tests, *slow()))
+    without = pulse.circuit(pulse.calibrate_cell(tests, *slow()))
     assert left(cell) < 0.5 * left(without)
 
 
@@ -61,7 +61,7 @@ def test_it_may_take_all_of_r0():
     tests = [cell(seed=k).run([(0.0, 600, 100), *8 * levels], t, f"{t:g}.csv") for k, t in runs]
     ocv, capacity = slow()
     other = replace(ocv, value=ocv.value + 0.01 * np.sin(6 * ocv.axes["soc"]))  # of a cell that is much alike
-    result = pulse.calibrate(tests, other, capacity)
+    result = pulse.calibrate_cell(tests, other, capacity)
     resistance = result.parameters["charge_transfer_resistance"]
     assert abs(resistance.value - 0.06) < resistance.sd < 0.01
     r0 = result.curves["battery.r0"].value

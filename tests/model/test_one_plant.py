@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.calibration.cell_circuit import Circuit, Reaction, voltage
+from gz_onboard.calibration.circuit import Circuit, Reaction, voltage
 from gz_onboard.calibration.coastdown_run import Coast
 from gz_onboard.calibration.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures
 from gz_onboard.calibration.cooling_run import CoolingRun
