@@ -22,9 +22,9 @@ from statistics import median
 
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.events import Estimate
-from gz_onboard.offline.samples import open_ride
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed
+from gz_onboard.recording.recording import open_ride
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = Path(__file__).resolve().parent.parent / "tests" / "vehicles" / "i3" / "trips.toml"

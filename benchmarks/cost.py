@@ -45,9 +45,9 @@ def pipeline() -> dict[str, float]:
 
     found = {"pipeline, live path": 1e6 * _best(ride) / number}
     with contextlib.suppress(ImportError):
-        from gz_onboard.offline.samples import read_samples
+        from gz_onboard.recording.recording import read_recording
 
-        found["log to columns of signals"] = 1e6 * _best(lambda: read_samples(RIDE, vehicle)) / number
+        found["log to columns of signals"] = 1e6 * _best(lambda: read_recording(RIDE, vehicle)) / number
     return found
 
 

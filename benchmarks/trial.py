@@ -34,7 +34,7 @@ from scipy.stats import binomtest
 from gz_onboard.discovery.baseline import baseline
 from gz_onboard.discovery.run import discover
 from gz_onboard.offline.processes import worker_pool
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.reports.results import to_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests import plant
@@ -50,13 +50,13 @@ LACKS = {"file": {"cornering_drag"}, "baseline": set()}
 plant's tyres twist on the road; a baseline has learned it."""
 
 
-def material(seeds: Sequence[int], keep: Path | None) -> tuple[list[Samples], list[plant.Case]]:
+def material(seeds: Sequence[int], keep: Path | None) -> tuple[list[Recording], list[plant.Case]]:
     """Healthy rides and cases of one scooter; ridden now, or taken from the folder `keep`, and put there if new."""
     number = seeds[0] // CASES_OF_A_SCOOTER
     file = keep / f"{seeds[0]}-{seeds[-1]}.pickle" if keep else None
     if file and file.is_file():
         with file.open("rb") as stream:
-            kept: tuple[list[Samples], list[plant.Case]] = pickle.load(stream)
+            kept: tuple[list[Recording], list[plant.Case]] = pickle.load(stream)
             return kept
     healthy, cases = plant.trial([number], seeds)
     if file:
@@ -66,7 +66,7 @@ def material(seeds: Sequence[int], keep: Path | None) -> tuple[list[Samples], li
     return healthy[number], cases
 
 
-def discovered(vehicle: Vehicle, rides: Sequence[Samples], seed: int = 0) -> Row:
+def discovered(vehicle: Vehicle, rides: Sequence[Recording], seed: int = 0) -> Row:
     """The JSON of a discovery."""
     report = to_json(discover(vehicle, rides, seed).report)
     assert isinstance(report, dict)

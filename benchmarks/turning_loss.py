@@ -22,7 +22,7 @@ from gz_onboard.discovery.extend import write_model
 from gz_onboard.discovery.judgement import METRICS, Discovery, Gain
 from gz_onboard.discovery.report import before_and_after, binned, edges, pooled
 from gz_onboard.discovery.run import discover
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded
 from gz_onboard.vehicle import read_vehicle
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("docs/images"), metavar="DIR")
     output: Path = parser.parse_args().output
     vehicle = read_vehicle("reference")
-    rides = [read_samples(log, vehicle) for log in (*TOWN, OVAL)]
+    rides = [read_recording(log, vehicle) for log in (*TOWN, OVAL)]
     every = discover(vehicle, rides, workers=2)
     residual(every, output / "turning_loss_residual.png")
     gain(every.report.gain, output / "turning_loss_gain.png")

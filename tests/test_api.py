@@ -281,7 +281,7 @@ def test_options_of_a_discovery_are_checked(options, said):
 
 
 def test_samples_may_be_lists():
-    ride = anyhow.Samples("x", {"vehicle_speed": ([0, 1], [3, 4])})
+    ride = anyhow.Recording("x", {"vehicle_speed": ([0, 1], [3, 4])})
     assert [one.dtype for one in ride.columns["vehicle_speed"]] == [float, float]
 
 
@@ -325,12 +325,12 @@ def test_the_rides_held_out_are_those_given():
         (lambda: anyhow.summary_table([3]), r"rides \[3\]: must be a list \(each EstimatedRide\)"),
         (lambda: anyhow.read_estimates(3), "log 3: must be a text or a path"),
         (
-            lambda: anyhow.Samples("x", {"vehicle_speed": (np.arange(2), np.arange(3))}),
+            lambda: anyhow.Recording("x", {"vehicle_speed": (np.arange(2), np.arange(3))}),
             "x: vehicle_speed: .* one length",
         ),
-        (lambda: anyhow.Samples("x", {"vehicle_sped": (np.arange(2), np.arange(2))}), "did you mean 'vehicle_speed'"),
-        (lambda: anyhow.Samples("x", {"vehicle_speed": (np.array([1, 0]), np.arange(2))}), "times do not increase"),
-        (lambda: anyhow.Samples("x", None), "columns None: must be a mapping"),
+        (lambda: anyhow.Recording("x", {"vehicle_sped": (np.arange(2), np.arange(2))}), "did you mean 'vehicle_speed'"),
+        (lambda: anyhow.Recording("x", {"vehicle_speed": (np.array([1, 0]), np.arange(2))}), "times do not increase"),
+        (lambda: anyhow.Recording("x", None), "columns None: must be a mapping"),
     ],
 )
 def test_what_is_not_of_its_type_is_an_input_error_with_its_name(call, said):
@@ -392,7 +392,7 @@ def test_facts_are_checked_wherever_they_come_from(facts, said, tmp_path):
     with pytest.raises(gz.InputError, match=said):
         gz.read_ride(COASTDOWN, facts=facts)
     with pytest.raises(gz.InputError, match=said):
-        gz.Samples("x", {}, facts)
+        gz.Recording("x", {}, facts)
     if isinstance(facts, dict):
         (tmp_path / "coastdown.blf").write_bytes(COASTDOWN.read_bytes())
         (tmp_path / "rides.json").write_text(json.dumps([{"name": "coastdown", **facts}]))
@@ -551,7 +551,7 @@ def test_what_was_learned_is_that_of_the_command(saved, capsys):
 def test_a_baseline_is_written_and_compared_with(tmp_path):
     ride = gz.read_ride(LOGS / "city_34C.blf")
 
-    def part(start: float) -> gz.Samples:
+    def part(start: float) -> gz.Recording:
         held = {role: (times >= start) & (times < start + 90) for role, (times, _) in ride.columns.items()}
         columns = {role: (times[held[role]], values[held[role]]) for role, (times, values) in ride.columns.items()}
         return replace(ride, name=f"from {start:g} s", columns=columns)

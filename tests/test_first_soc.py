@@ -10,8 +10,8 @@ from gz_onboard.discovery.mixed_model import initial
 from gz_onboard.discovery.residuals import start_soc
 from gz_onboard.events import Group
 from gz_onboard.model.effect import Port
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.series import all_quantities, first_soc, total
+from gz_onboard.recording.recording import Recording
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
@@ -36,7 +36,7 @@ def shown(amperes: float) -> float:
     return float(PACK.pack_voltage(cell_voltage(PACK, SOC, 0.0, cell, COLD) - lost, amperes))
 
 
-def ride(amperes: float) -> Samples:
+def ride(amperes: float) -> Recording:
     time = np.arange(0.0, SECONDS, 0.05)
     values = {
         "motor_speed": 0.0,
@@ -47,7 +47,7 @@ def ride(amperes: float) -> Samples:
         "pack_voltage": shown(amperes) + P["pack_voltage_offset"],
         "pack_current": amperes * P["pack_current_gain"] + P["pack_current_offset"],
     }
-    return Samples("standing", {role: (time, np.full(len(time), value)) for role, value in values.items()}, {})
+    return Recording("standing", {role: (time, np.full(len(time), value)) for role, value in values.items()}, {})
 
 
 @AMPERES

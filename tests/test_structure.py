@@ -18,7 +18,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
     ["arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
-    ["imports", "options"],
+    ["arguments", "imports", "options"],
     ["toml", "routes"],
     ["can", "model"],
     ["vehicle"],

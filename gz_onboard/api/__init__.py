@@ -16,7 +16,7 @@ from gz_onboard.api.simulations import SimulatedRide, Swept, simulate, sweep
 from gz_onboard.api.validations import Validated, validate
 from gz_onboard.discovery.command import DiscoveryOptions
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.simulation.plan import SimulationOptions
 from gz_onboard.vehicle import Vehicle
 
@@ -33,8 +33,8 @@ __all__ = [
     "LoggedFrames",
     "LoggedMessage",
     "LoggedSignals",
+    "Recording",
     "Reported",
-    "Samples",
     "SimulatedRide",
     "SimulationOptions",
     "Swept",

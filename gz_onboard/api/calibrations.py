@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, file_of
+from gz_onboard.arguments import checked
 from gz_onboard.calibration import command as calibration
 from gz_onboard.calibration import report
 from gz_onboard.calibration.result import Result
 from gz_onboard.calibration.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.errors import InputError, not_an_input, writing
-from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 

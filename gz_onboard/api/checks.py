@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
+from gz_onboard.arguments import checked
 from gz_onboard.errors import brief
-from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress

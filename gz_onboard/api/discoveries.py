@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, read_ride, read_vehicle, vehicle_of
+from gz_onboard.arguments import checked
 from gz_onboard.calibration.vehicle_file import vehicle_output
 from gz_onboard.discovery.baseline import baseline as learn_baseline
 from gz_onboard.discovery.baseline import write_baseline
@@ -19,9 +20,8 @@ from gz_onboard.discovery.mixed_model import MixedModel
 from gz_onboard.discovery.report import summary, write_report
 from gz_onboard.discovery.run import discover as find
 from gz_onboard.errors import InputError, brief, not_an_input, writing
-from gz_onboard.offline.arguments import checked
-from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.offline.table import Columns, Tabular, columns_of
+from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.reports.results import distinct_names
 from gz_onboard.vehicle import Vehicle
 
@@ -64,7 +64,7 @@ class Discovered(Tabular):
             write_report(self.found, Path(file))
 
 
-Rides: TypeAlias = PathLike | Signals | Samples | Sequence[PathLike | Signals | Samples]
+Rides: TypeAlias = PathLike | Signals | Recording | Sequence[PathLike | Signals | Recording]
 """Logs, folders of logs, tables of signals, or what `read_ride` gave."""
 
 
@@ -149,9 +149,9 @@ def baseline(
     return Baseline(found, known, found.healthy.checked, [known.file, *logs])
 
 
-def _samples_of(rides: Rides, known: Vehicle) -> tuple[list[Samples], list[Path]]:
+def _samples_of(rides: Rides, known: Vehicle) -> tuple[list[Recording], list[Path]]:
     """The samples of rides, each by another name, and the logs that were read."""
-    several = [rides] if isinstance(rides, str | os.PathLike | Samples | Mapping) else rides
+    several = [rides] if isinstance(rides, str | os.PathLike | Recording | Mapping) else rides
     several = several if isinstance(several, Sequence) else [several]
     given = [
         (f"table {i}", log)
@@ -160,12 +160,12 @@ def _samples_of(rides: Rides, known: Vehicle) -> tuple[list[Samples], list[Path]
     ]
     logs = [ride for _, ride in given if isinstance(ride, Path)]
     names = iter(distinct_names(logs, [ride_name(log) for log in logs]))
-    samples: list[Samples] = []
+    samples: list[Recording] = []
     for name, ride in given:
         if isinstance(ride, Path):
-            samples.append(replace(read_samples(ride, known), name=next(names)))
+            samples.append(replace(read_recording(ride, known), name=next(names)))
         else:
-            samples.append(ride if isinstance(ride, Samples) else read_ride(ride, known, name=name))
+            samples.append(ride if isinstance(ride, Recording) else read_ride(ride, known, name=name))
     called = [ride.name for ride in samples]
     if twice := sorted({name for name in called if called.count(name) > 1}):
         raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")

@@ -11,6 +11,7 @@ import numpy as np
 
 from gz_onboard import state as saved_state
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehicle_of
+from gz_onboard.arguments import checked
 from gz_onboard.errors import brief, not_an_input, writing
 from gz_onboard.estimation import summary
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, RideRun, open_estimate, run_ride, state_for
@@ -18,10 +19,9 @@ from gz_onboard.estimation.saved_state import held, text_of
 from gz_onboard.estimation.summary import RideSummary, summary_of, summary_text
 from gz_onboard.lab import export_tables
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log
-from gz_onboard.offline.arguments import checked
-from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of, table_columns
 from gz_onboard.progress import Progress
+from gz_onboard.recording.tables import SignalTable
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
+from gz_onboard.arguments import checked, within
 from gz_onboard.errors import InputError, brief
 from gz_onboard.events import Frame
 from gz_onboard.lab import export_tables
 from gz_onboard.offline import write_tables
-from gz_onboard.offline.arguments import checked, within
 from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.options import LONGEST_LOG
 from gz_onboard.recording.frames import FrameColumns

@@ -8,12 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from gz_onboard.offline.arguments import checked, within
+from gz_onboard.arguments import checked, within
 from gz_onboard.offline.correlations import correlations
-from gz_onboard.offline.samples import Samples, read_samples
-from gz_onboard.offline.signal_table import SignalTable
-from gz_onboard.offline.table import signal_table
 from gz_onboard.options import MOST_PAYLOAD
+from gz_onboard.recording.recording import Recording, read_recording
+from gz_onboard.recording.tables import SignalTable, table_of
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle import read_vehicle as read_vehicle_file
 
@@ -33,7 +32,7 @@ Signals: TypeAlias = Mapping[str, Any] | ArrowTable
 
 def source_of(data: PathLike | Signals, name: str = "table") -> Path | SignalTable:
     """A path, or the table of signals of a ride. name: what errors call that."""
-    return Path(data) if isinstance(data, str | os.PathLike) else signal_table(data, name)
+    return Path(data) if isinstance(data, str | os.PathLike) else table_of(data, name)
 
 
 VehicleLike: TypeAlias = Vehicle | PathLike
@@ -70,11 +69,11 @@ def read_ride(
     *,
     name: str | None = None,
     facts: Mapping[str, object] | None = None,
-) -> Samples:
+) -> Recording:
     """The samples of a ride by role, in SI units: of a log, or of a table of signals.
 
     name: of the ride; that of the log if not given. facts: what is known of it beside its signals, such as
     ``{"rider_mass_kg": 85.0}``, in place of what a ``rides.json`` beside the log says of the same. Raises InputError.
     """
-    ride = read_samples(source_of(source, name or "table"), vehicle_of(vehicle))
+    ride = read_recording(source_of(source, name or "table"), vehicle_of(vehicle))
     return replace(ride, name=name or ride.name, facts={**ride.facts, **(facts or {})})

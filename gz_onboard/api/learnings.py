@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
+from gz_onboard.arguments import checked
 from gz_onboard.daemon import learned as command
 from gz_onboard.errors import brief
 from gz_onboard.estimator.pack_age import LearnedFactor
-from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.state import state_file
 

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
+from gz_onboard.arguments import checked
 from gz_onboard.errors import InputError
-from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.output import series_table

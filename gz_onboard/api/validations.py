@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
+from gz_onboard.arguments import checked
 from gz_onboard.errors import InputError
-from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
 from gz_onboard.recording.logs import logs_among

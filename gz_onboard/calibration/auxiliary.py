@@ -12,8 +12,8 @@ from gz_onboard.calibration.result import Found, LackingError, Panel, PlotLine, 
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
 from gz_onboard.offline.arrays import held_at
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import speed_role
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 NEEDED = ("auxiliary_current", "pack_voltage")
@@ -22,7 +22,7 @@ STANDING, LEAST_STANDING = 0.05, 20  # m/s; samples at rest of a ride
 CURRENT_SD = 0.01  # of the current, relative: a shunt's calibration
 
 
-def auxiliary_power(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def auxiliary_power(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """auxiliary_power [W] by the auxiliary current; of rides that lack it, by the pack's power at standstill.
 
     Raises InputError if no ride has either.
@@ -32,7 +32,7 @@ def auxiliary_power(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return at_standstill(rides, vehicle)
 
 
-def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def at_standstill(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """auxiliary_power [W] as the pack's power while the vehicle stands, less the inverter's own and what a heater and
     an air conditioner take. Its sd is of a ride to come, with that of the inverter's own. LackingError without one.
     """
@@ -60,7 +60,7 @@ def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def standing(ride: Samples, p: Mapping[str, float]) -> tuple[Mask, Array]:
+def standing(ride: Recording, p: Mapping[str, float]) -> tuple[Mask, Array]:
     """(whether the vehicle stands; the pack's power [W] less the inverter's own, a heater's and an air conditioner's).
 
     At the times of the pack's current, (n,). InputError for a ride without a speed.
@@ -74,7 +74,7 @@ def standing(ride: Samples, p: Mapping[str, float]) -> tuple[Mask, Array]:
     return np.abs(np.interp(time, *ride.columns[role])) * factor < STANDING, power
 
 
-def by_auxiliary_current(rides: Sequence[Samples]) -> Result:
+def by_auxiliary_current(rides: Sequence[Recording]) -> Result:
     """auxiliary_power [W]: its mean over the rides, each counting once.
 
     The brake light makes it one of two values; the mean holds it as often as these riders braked. The sd is that of one
@@ -125,7 +125,7 @@ def _mean(values: Array) -> float:
     return float(values.mean()) if len(values) > 9 else float("nan")
 
 
-def _light(ride: Samples, time: Array) -> Mask:
+def _light(ride: Recording, time: Array) -> Mask:
     """Whether the brake light shone at each of `time`; it did not if the ride has no brake switch."""
     if "brake_switch" not in ride.columns:
         return np.zeros(len(time), dtype=bool)

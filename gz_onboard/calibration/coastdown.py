@@ -21,7 +21,7 @@ from gz_onboard.calibration.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.calibration.road_load import NAMES, RoadLoad, own_wind, roll
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 WIND_SD = 1.0  # m/s: a constant wind along the track on a day that was chosen for coast-downs
@@ -29,7 +29,7 @@ SLOPE_SD = 0.01  # sine: a track that was chosen for coast-downs
 
 
 def calibrate(
-    runs: Sequence[Samples],
+    runs: Sequence[Recording],
     vehicle: Vehicle,
     *,
     wind_sd: float = WIND_SD,
@@ -105,7 +105,7 @@ def _fitted(
     return best, covariance, shares
 
 
-def _coasting_current(run: Samples, c: Coast) -> float:
+def _coasting_current(run: Recording, c: Coast) -> float:
     t, current = run.columns["motor_current"]
     inside = (t >= c.time[0]) & (t <= c.time[-1])
     return float(current[inside].mean()) if inside.any() else 0.0

@@ -11,8 +11,8 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.offline.samples import Samples, read_facts
 from gz_onboard.offline.sensors import speed_role, true_columns
+from gz_onboard.recording.recording import Recording, read_facts
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s
@@ -57,7 +57,7 @@ class Coast:
         return np.asarray(-np.diff(self.speed) / np.diff(self.time))
 
 
-def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Samples:
+def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Recording:
     """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
 
     facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or
@@ -79,10 +79,10 @@ def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> S
             raise table.error(f"{notes.name} beside it says no {' or '.join(keys)} of {name!r}{close}")
     if "ambient_temperature" not in table and "ambient_C" not in known:
         raise table.error(f"no column ambient_temperature, and {notes.name} beside it says no ambient_C of {name!r}")
-    return Samples(name, {new or old: (time, table[old]) for old, new in _ROLES.items() if old in table}, known)
+    return Recording(name, {new or old: (time, table[old]) for old, new in _ROLES.items() if old in table}, known)
 
 
-def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
+def coast(run: Recording, vehicle: Vehicle, direction: int) -> Coast:
     """The longest coasting of `run`: throttle closed, no brake, no current, down to `SLOWEST`.
 
     Raises InputError for a run that has no speed, is too short, in which the motor drives or the speed rises.
@@ -126,12 +126,12 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     return Coast(run.name, ends, at, direction, known, mass, _temperature(run), altitude)
 
 
-def run_start(run: Samples) -> float:
+def run_start(run: Recording) -> float:
     """The time of the first sample [s]."""
     return float(min(t[0] for t, _ in run.columns.values()))
 
 
-def _temperature(run: Samples) -> float:
+def _temperature(run: Recording) -> float:
     if "ambient_temperature" in run.columns:
         return float(run.columns["ambient_temperature"][1].mean())
     noted = run.facts.get("ambient_C")
@@ -156,7 +156,7 @@ def _longest(rolling: Any, time: Array) -> tuple[int, int]:
     return int(best[0]), int(best[1])
 
 
-def _check_current(run: Samples, time: Array, driving: float) -> None:
+def _check_current(run: Recording, time: Array, driving: float) -> None:
     """Refuse a run with a current beyond `driving` [A] over its median, the sensor's offset: the motor works."""
     if "motor_current" not in run.columns:
         return
@@ -175,7 +175,7 @@ def _check_current(run: Samples, time: Array, driving: float) -> None:
         )
 
 
-def _check_falling(run: Samples, time: Array, speed: Array) -> None:
+def _check_falling(run: Recording, time: Array, speed: Array) -> None:
     """Refuse a run whose mean speed rises from one `RISE_TIME` to the next by more than its noise explains."""
     count = max(int((time[-1] - time[0]) / RISE_TIME), 1)
     means, sds = [], []
@@ -209,7 +209,7 @@ def _smooth(time: Array, speed: Array, ends: Array) -> Array:
     return result
 
 
-def directions(runs: Sequence[Samples]) -> list[int]:
+def directions(runs: Sequence[Recording]) -> list[int]:
     """+1 or -1 for each run: as noted (``direction``; the first alphabetically but ``up`` is +1), else by GPS course.
 
     Raises InputError if there is neither.

@@ -20,10 +20,10 @@ from gz_onboard.calibration.table import read_table
 from gz_onboard.calibration.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.errors import OK, InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.model.effect import load_effect
-from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
 from gz_onboard.recording.logs import logs_among
+from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.reports.results import write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
@@ -36,7 +36,7 @@ def calibrate(
     begin: is called with the name of each part of the work that begins. Raises InputError for data that cannot be
     used, naming the procedure; one of several that no ride has the sensors for is refused, and the others go on.
     """
-    read: dict[Path, Samples] = {}
+    read: dict[Path, Recording] = {}
     results: list[Result] = []
     with tempfile.TemporaryDirectory() as folder:
         for step in steps:
@@ -51,7 +51,7 @@ def calibrate(
                         given.tables.setdefault(slot, []).append(read_table(file, step.columns.get(slot)))
                         continue
                     if file not in read:
-                        read[file] = read_samples(file, vehicle)
+                        read[file] = read_recording(file, vehicle)
                     given.rides.setdefault(slot, []).append(read[file])
             begin(f"{step.procedure}: fitting")
             try:

@@ -19,9 +19,9 @@ from gz_onboard.model.effect import Port
 from gz_onboard.model.model import STOOD, stepping
 from gz_onboard.offline.arrays import held_integral
 from gz_onboard.offline.cooling import PERIOD
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import road_speed, true_columns
 from gz_onboard.offline.series import advanced, all_quantities, first_soc, idle_loss, total
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 FIRST = 1.0  # s: whose mean voltage and current tell the state of charge at the start, before the load has grown
@@ -102,7 +102,7 @@ def bench_run(table: Measurements, vehicle: Vehicle, airflow: float | str = "non
     )
 
 
-def ride_run(ride: Samples, vehicle: Vehicle, airflow: float | str = "wheel") -> CoolingRun:
+def ride_run(ride: Recording, vehicle: Vehicle, airflow: float | str = "wheel") -> CoolingRun:
     """A ride or dynamometer run with the heat that the vehicle's own losses give. InputError for signals it lacks."""
     for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
         if role not in ride.columns:

@@ -19,7 +19,7 @@ from gz_onboard.calibration.result import Found, LackingError, Panel, PlotLine, 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.arrays import block_means
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 NEEDED = "pack_current pack_voltage inverter_current inverter_voltage motor_speed motor_current"
@@ -49,7 +49,7 @@ class Pair(NamedTuple):
     lag: float  # s: of the pack's sensors behind the inverter's
 
 
-def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
+def read_pair(ride: Recording, vehicle: Vehicle) -> Pair:
     """The readings of pack and inverter at the same times, their lag taken off. InputError for what is missing."""
     for role in NEEDED.split():
         if role not in ride.columns:
@@ -71,7 +71,7 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
     return Pair(ride.name, time, pack, inverter, auxiliary, at("pack_voltage"), inverter_voltage, rest, lag)
 
 
-def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def offsets(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """pack_current_offset, pack_current_gain, both noises and pack_voltage_offset of the pack's sensors.
 
     Of rides that all lack the inverter's, see `at_standstill`. Raises InputError if none stands still for `LEAST_REST`
@@ -119,7 +119,7 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def at_standstill(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """Both noises and, of rides with auxiliary_current, pack_current_offset, while the vehicle stands.
 
     Raises LackingError if no ride has pack_voltage and pack_current and stands for `LEAST_REST` samples.

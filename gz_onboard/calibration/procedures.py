@@ -27,8 +27,8 @@ from gz_onboard.calibration.manifest import Option, Slot
 from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples, ride_name
 from gz_onboard.offline.sensors import true_columns
+from gz_onboard.recording.recording import Recording, ride_name
 from gz_onboard.vehicle import Vehicle
 
 
@@ -39,7 +39,7 @@ class Given:
     vehicle: Vehicle  # with the results of earlier steps
     earlier: list[Result]
     tables: dict[str, list[Measurements]] = field(default_factory=dict)  # by slot
-    rides: dict[str, list[Samples]] = field(default_factory=dict)
+    rides: dict[str, list[Recording]] = field(default_factory=dict)
     options: dict[str, Option] = field(default_factory=dict)
 
     def number(self, name: str) -> float:
@@ -107,13 +107,13 @@ def _open_circuit(given: Given) -> tuple[Curve, Found]:
     return curve, Found(known.value, known.sd, known.unit, known.source)
 
 
-def _true(given: Given, data: str) -> list[Samples]:
+def _true(given: Given, data: str) -> list[Recording]:
     """The rides without what the vehicle's sensors are known to err by."""
     parameters = given.vehicle.parameters
     return [replace(ride, columns=true_columns(ride.columns, parameters)) for ride in given.rides.get(data, [])]
 
 
-def _load(ride: Samples) -> Array:
+def _load(ride: Recording) -> Array:
     """The pack current of a ride [A], once a second."""
     if "pack_current" not in ride.columns:
         raise InputError(f"{ride.name}: has no pack_current, so it is no load for the cell")

@@ -21,9 +21,9 @@ from gz_onboard.model.battery import discharged
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import standing_load
 from gz_onboard.offline.arrays import held_integral
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import true_columns
 from gz_onboard.offline.series import first_soc
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s
@@ -37,7 +37,7 @@ VOLTAGE_GAIN_SD = 1e-3  # of each voltage sensor: a volt of either's gain over t
 CELL_SHARE_SD = 0.05  # of the cells' resistance, from cell to cell and from table to step
 
 
-def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def cable_resistance(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """cable_resistance [ohm] between the two voltage sensors. InputError for rides without current."""
     result = Result("cable_resistance")
     rows, labels = [], []
@@ -79,7 +79,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
+def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
     """pack_series_resistance [ohm]: 0.2 s steps of warm rides less what the cells alone give in that time.
 
     pulses: pulse tests of a cell at two temperatures or more, with `time`, `current`, `voltage` and `cell_temperature`:
@@ -125,7 +125,7 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
 
 
 def _ride_steps(
-    ride: Samples, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, least: float, result: Result
+    ride: Recording, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, least: float, result: Result
 ) -> tuple[Array, Array, Array] | None:
     """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
 
@@ -189,7 +189,7 @@ def cell_steps(pulses: Sequence[Measurements]) -> tuple[Array, Array]:
     return temperature, logarithm
 
 
-def _mean_of(ride: Samples, role: str) -> float:
+def _mean_of(ride: Recording, role: str) -> float:
     if role not in ride.columns:
         raise InputError(f"{ride.name}: no {role}, without which the cells' part of a step is unknown")
     return float(ride.columns[role][1].mean())

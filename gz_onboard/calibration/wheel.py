@@ -12,8 +12,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.result import Fit, Found, LackingError, Panel, PlotLine, Result
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import true_columns
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 SLOWEST = 5.0  # m/s: below, a receiver's speed is poor
@@ -24,7 +24,7 @@ TURNING = ("motor_speed", "wheel_speed_rear")  # rad/s: what turns with the driv
 RECEIVER = 0.002  # relative: Doppler speed of a receiver in the open
 
 
-def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+def calibrate(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
 
     By motor_speed, of rides without it by wheel_speed_rear. Raises LackingError if no ride has both.

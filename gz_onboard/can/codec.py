@@ -242,7 +242,7 @@ class Codec:
         self.mapping = mapping
         self.longest_pause_ns = longest_pause_ns  # None: any leap ahead is a pause
         self.leaps: list[tuple[float, float]] = []  # of the clock: when [s on our timeline], by how much [s]
-        self.groups: list[Group] = []
+        self.groups: list[Group] = list(mapping.groups)
         self.faults: Counter[tuple[str, str]] = Counter()  # (message, reason) -> frames or signals dropped
         self.lost: Counter[str] = Counter()  # message -> frames that its counter shows as missing
         self.unknown: Counter[int] = Counter()  # identifier -> frames, of the first few thousand identifiers

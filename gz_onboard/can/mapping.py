@@ -5,7 +5,7 @@ docs/reference/vehicle-file.md describes the keys.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi
 from pathlib import Path
@@ -15,7 +15,7 @@ from gz_onboard.can.dbc import LARGEST, SMALLEST, LeftOut, empty_database, find_
 from gz_onboard.can.requests import Request, read_requests
 from gz_onboard.constants import GRAVITY, KELVIN
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.events import CURRENTS, EFF_FLAG, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES
+from gz_onboard.events import CURRENTS, EFF_FLAG, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -107,6 +107,7 @@ class BusMapping:
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
     requests: tuple[Request, ...] = ()  # of other testers, whose answers are read
     time: TimeColumn | None = None  # of tables; None: the first column that is called so
+    groups: tuple[Group, ...] = ()  # of a table's columns, which come without frames
 
     @property
     def reads_frames(self) -> bool:
@@ -263,11 +264,22 @@ def _source(messages: Sequence[Message], left_out: LeftOut, roles: Table, role: 
         said = f"signal {shown(name)} stands in several messages ({several}): say which, by message = ..."
         raise table.error(said, key)
     ((message, signal),) = found
-    unit = table.text("unit", signal.unit or "")
+    scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+    return _scaled(table, key, role, (message.name, name), signal.unit or "", (scale, offset))
+
+
+def _scaled(
+    table: Table, key: str, role: str, place: tuple[str, str], default_unit: str, conversion: tuple[float, float]
+) -> Source:
+    """Return the source of `role` at `place` (message, signal), with the unit, scale and offset that `table` states.
+
+    key: where errors point to; conversion: factor and offset from raw values to `default_unit`.
+    """
+    unit = table.text("unit", default_unit)
     si = to_si(unit, role)
     if si is None:
         raise table.error(
-            f"{name!r} has unit {shown(unit)}, from which {role} [{UNITS[role]}] cannot be had; "
+            f"{place[1]!r} has unit {shown(unit)}, from which {role} [{UNITS[role]}] cannot be had; "
             f"give unit = one of {', '.join(known_units(role))}{nearest(unit, known_units(role)) if unit else ''}",
             key,
         )
@@ -275,18 +287,27 @@ def _source(messages: Sequence[Message], left_out: LeftOut, roles: Table, role: 
     if abs(scale) < SMALLEST:
         raise table.error(f"must not be 0, nor within {SMALLEST:g} of it, is {scale:g}", "scale")
     shift = table.number("offset", 0.0, -LARGEST, LARGEST)
-    factor, offset = float(signal.conversion.scale), float(signal.conversion.offset)
-    return Source(role, message.name, name, factor * si[0] * scale, (offset * si[0] + si[1]) * scale + shift)
+    factor, offset = conversion
+    return Source(role, *place, factor * si[0] * scale, (offset * si[0] + si[1]) * scale + shift)
 
 
-def column_sources(database: Database, roles: Table, file: Path) -> tuple[Source, ...]:
-    """The sources of `roles` among the columns of the table `file`, each of which is a signal of `database`."""
+def column_sources(units: Mapping[str, str], roles: Table, file: Path) -> tuple[Source, ...]:
+    """Return the sources of `roles` among the columns of the table `file`, whose units are given by name."""
     try:
-        sources = tuple(_source(database.messages, {}, roles, role) for role in roles.values)
+        sources = tuple(_column_source(units, roles, role) for role in roles.values)
         _check_witnesses(sources, roles)
     except InputError as error:
         raise InputError(f"{file}: its columns do not fit: {error}") from error
     return sources
+
+
+def _column_source(units: Mapping[str, str], roles: Table, role: str) -> Source:
+    table = roles.table(role, short="signal")
+    table.only(["signal", "unit", "scale", "offset"])
+    name, key = table.text("signal"), "signal" if table.values is roles.values[role] else ""
+    if name not in units:
+        raise table.error(f"there is no column {shown(name)}{nearest(name, units)}", key)
+    return _scaled(table, key, role, (name, name), units[name], (1.0, 0.0))
 
 
 def _check_witnesses(sources: tuple[Source, ...], where: Table) -> None:

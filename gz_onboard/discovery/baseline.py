@@ -31,7 +31,7 @@ from gz_onboard.discovery.search import with_own_start
 from gz_onboard.errors import InputError
 from gz_onboard.lab.overrun import ENTERED, FAR, overrun, stop_at
 from gz_onboard.model.parameters import Parameters, Value, declared_parameters
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 LEAST_RIDES = 3
@@ -71,7 +71,7 @@ class Learned:
 
 def baseline(
     vehicle: Vehicle,
-    healthy: Sequence[Samples],
+    healthy: Sequence[Recording],
     folder: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
     workers: int = 1,

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gz_onboard.arguments import check_fields
 from gz_onboard.calibration.vehicle_file import vehicle_output
 from gz_onboard.discovery.baseline import baseline, write_baseline
 from gz_onboard.discovery.extend import write_model
@@ -16,12 +17,11 @@ from gz_onboard.discovery.parameters import candidates
 from gz_onboard.discovery.report import listing, summary
 from gz_onboard.discovery.run import discover, known_rides
 from gz_onboard.errors import InputError, near_file, not_an_input, writing
-from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.logs import log_suffix, logs_among
+from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.reports.results import distinct_names, write_json
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
@@ -145,8 +145,8 @@ class _Reading(Task):
     effects: Path | None = None  # folder of the user's own
 
 
-def _read(task: _Reading, _: Progress) -> Samples:
-    samples = read_samples(task.path, read_vehicle(task.vehicle, effects_folder=task.effects))
+def _read(task: _Reading, _: Progress) -> Recording:
+    samples = read_recording(task.path, read_vehicle(task.vehicle, effects_folder=task.effects))
     if task.payload is not None and samples.rider_mass is None:
         samples = replace(samples, facts={**samples.facts, "rider_mass_kg": task.payload})
     return samples
@@ -154,10 +154,10 @@ def _read(task: _Reading, _: Progress) -> Samples:
 
 def read_rides(
     logs: Sequence[Path], names: Sequence[str], arguments: argparse.Namespace
-) -> tuple[list[Samples], list[str]]:
+) -> tuple[list[Recording], list[str]]:
     """The rides of these `names`, and why a log is none. InputError if no log is one."""
     tasks = [_Reading(log, log, arguments.vehicle, arguments.payload, effects=arguments.effects) for log in logs]
-    rides: list[Samples] = []
+    rides: list[Recording] = []
     refused: list[str] = []
     with progress_bar(lambda: len(tasks), "rides", quiet=arguments.quiet) as display:
         for (_, result), name in zip(over_rides(_read, tasks, arguments.jobs), names, strict=True):

@@ -21,9 +21,9 @@ from gz_onboard.model.effect import MOVING, Port
 from gz_onboard.model.model import air_density
 from gz_onboard.model.sensors import grade_shown, true_current, true_voltage
 from gz_onboard.offline.arrays import block_means, running_mean
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import Vibration, road_speed, speed_role
 from gz_onboard.offline.series import total
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s
@@ -184,7 +184,7 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def with_stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, ...]]:
+def with_stand_ins(samples: Recording, vehicle: Vehicle) -> tuple[Recording, tuple[str, ...]]:
     """(`samples` with replacements for a missing motor speed or current, a sentence on each).
 
     The replacement is in no residual by itself. Raises InputError for a ride without any speed, or without any measure
@@ -209,7 +209,7 @@ def with_stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[s
     return replace(samples, columns=columns), tuple(words)
 
 
-def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
+def read_ride(samples: Recording, vehicle: Vehicle) -> Ride:
     """Put a ride of `vehicle` on the grid.
 
     Raises InputError for a ride without any speed, without motor current, torque, or voltage and current of the pack,

@@ -38,8 +38,8 @@ from gz_onboard.model.effect import Effect, Port
 from gz_onboard.model.parameters import declared_parameters
 from gz_onboard.offline.correlations import correlations
 from gz_onboard.offline.processes import worker_pool
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.series import relaxation
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 Noise = Mapping[str, ChannelNoise]  # by channel
@@ -385,7 +385,7 @@ class MixedModel(Population):
         """Linearised at `offset` (p,) in scales from here."""
         return replace(self, values=self.values_at(offset)) if np.any(offset) else self
 
-    def ride(self, samples: Samples) -> Ride:
+    def ride(self, samples: Recording) -> Ride:
         """`samples` on the grid of this vehicle."""
         ride = read_ride(samples, self.vehicle)
         if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:

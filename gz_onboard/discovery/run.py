@@ -16,7 +16,7 @@ from gz_onboard.discovery.mixed_model import MixedModel, linearised_about, witho
 from gz_onboard.discovery.residuals import voltage_timing
 from gz_onboard.discovery.search import search_causes, search_problem
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 SHORTEST = 300.0  # m: shorter rides show nothing
@@ -25,7 +25,7 @@ LINEAR_LATENCY = 0.15  # s: a delay up to which the step of the voltage is linea
 
 def discover(
     vehicle: Vehicle,
-    rides: Sequence[Samples],
+    rides: Sequence[Recording],
     seed: int = 0,
     folder: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
@@ -71,7 +71,7 @@ def known_rides(holdout: Sequence[str], names: Sequence[str]) -> None:
         raise InputError("holdout: no ride is left to be fitted")
 
 
-def read_all(mixed: MixedModel, rides: Sequence[Samples]) -> tuple[list[Ride], list[str]]:
+def read_all(mixed: MixedModel, rides: Sequence[Recording]) -> tuple[list[Ride], list[str]]:
     """The rides on the grid, and why others cannot be used. InputError if none can."""
     found: list[Ride] = []
     notes: list[str] = []

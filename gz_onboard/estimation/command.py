@@ -37,11 +37,12 @@ from gz_onboard.imports import require
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
-from gz_onboard.offline.samples import of_ride
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.recording.frames import SignalColumns
 from gz_onboard.recording.logs import ESTIMATED, read_metadata, read_samples
+from gz_onboard.recording.recording import of_ride
 from gz_onboard.reports.charts import overview
 from gz_onboard.reports.results import Failure, clock, number, write_json
 from gz_onboard.reports.style import save
@@ -220,11 +221,11 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
 
 
 def _estimate(task: EstimateTask) -> RideSummary:
-    vehicle = vehicle_of(task)
     route = read_route(task.route) if task.route else None
-    ride = open_estimate(task.path, vehicle)
-    if task.frames and ride.vehicle.mapping is not vehicle.mapping:
-        raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")
+    ride = open_estimate(task.path, vehicle_of(task))
+    if (task.frames or task.signals) and isinstance(ride.frames, SignalColumns):
+        option = "--frames" if task.frames else "--signals"
+        raise InputError(f"{task.path}: is a table of signals: {option} has nothing to log")
     with writing(task.log):
         task.part.parent.mkdir(parents=True, exist_ok=True)
         metadata = {

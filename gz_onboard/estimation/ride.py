@@ -22,13 +22,13 @@ from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import STATUS_TOPIC, Log, reason_names
 from gz_onboard.offline.processes import Task
-from gz_onboard.offline.samples import check_ridden, facts_of, of_ride, open_ride
-from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import Pipeline, range_publisher
 from gz_onboard.progress import Progress
 from gz_onboard.recording.decode import decode_columns, feed
-from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.frames import FrameColumns, SignalColumns
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.recording import check_ridden, facts_of, of_ride, open_ride
+from gz_onboard.recording.tables import SignalTable
 from gz_onboard.recording.timeline import on_timeline
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -43,12 +43,12 @@ class OpenRide:
     """A ride to be estimated.
 
     source: its log, or the name of its table. vehicle: with the mapping that decodes the ride. frames: without range
-    frames of an earlier run.
+    frames of an earlier run; of a table its values.
     """
 
     source: Path
     vehicle: Vehicle
-    frames: FrameColumns
+    frames: FrameColumns | SignalColumns
     damages: list[LogDamage]
 
     @property
@@ -183,7 +183,9 @@ def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
     name = source.name if isinstance(source, SignalTable) else source
     mapping, frames = open_ride(source, vehicle, damages.append)
     vehicle = _identified(replace(of_ride(vehicle, source), mapping=mapping), frames, str(name))
-    frames = _without_range_frames(frames, range_publisher(vehicle))
+    publisher = range_publisher(vehicle)
+    if isinstance(frames, FrameColumns):
+        frames = _without_range_frames(frames, publisher)
     if not len(frames):
         raise InputError(f"{name}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
     return OpenRide(name, vehicle, frames, damages)
@@ -196,7 +198,7 @@ def _without_range_frames(frames: FrameColumns, publisher: Publisher) -> FrameCo
     return frames[np.delete(np.arange(len(frames)), alike[own])] if any(own) else frames
 
 
-def _identified(vehicle: Vehicle, frames: FrameColumns, where: str) -> Vehicle:
+def _identified(vehicle: Vehicle, frames: FrameColumns | SignalColumns, where: str) -> Vehicle:
     """Return the vehicle of the number that the frames of the first minute show, if they show one."""
     sources = tuple(source for source in vehicle.mapping.instruments if source.role == "vehicle_id")
     if not sources:

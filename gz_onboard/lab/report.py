@@ -22,10 +22,10 @@ from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.arrays import held_at
 from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.processes import Task, collect, over_rides
-from gz_onboard.offline.samples import Samples, read_samples, ride_name
-from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.recording.recording import Recording, read_recording, ride_name
+from gz_onboard.recording.tables import SignalTable
 from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance
 from gz_onboard.reports.page import drawn, html_table, page, tiles
 from gz_onboard.reports.results import FIRST_DATE_NS, clock, number
@@ -35,7 +35,7 @@ from gz_onboard.vehicle import Vehicle, find_vehicle
 LEAST_WH = 0.05
 """Smaller entries of the ledger are left out."""
 LONGEST_GAP_S = 10.0
-"""Samples further apart have a hole between them."""
+"""Recording further apart have a hole between them."""
 MOST_CHANGES = 20
 TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")
 """Causes that a sensor which is left out may have taught."""
@@ -159,7 +159,7 @@ def report_of(
     road = read_route(route) if route else None
     log = MemoryLog()
     ridden = run_ride(open_estimate(source, vehicle), RideOptions(route=road, ledger=True), log, progress)
-    samples = read_samples(source, vehicle)
+    samples = read_recording(source, vehicle)
     return ReportedRide(
         samples.name,
         summary_of(ridden),
@@ -170,14 +170,14 @@ def report_of(
     )
 
 
-def _series(samples: Samples, role: str) -> Series:
+def _series(samples: Recording, role: str) -> Series:
     """The samples of a role, with a NaN in each hole, through which no line is drawn."""
     times, values = samples.columns[role]
     holes = np.flatnonzero(np.diff(times) > LONGEST_GAP_S) + 1
     return np.insert(times, holes, times[holes]).tolist(), np.insert(values, holes, np.nan).tolist()
 
 
-def path_of(samples: Samples) -> list[list[Position]]:
+def path_of(samples: Recording) -> list[list[Position]]:
     """The positions by a receiver with a fix, split at holes; empty with fewer than two."""
     if not {"latitude", "longitude"} <= samples.columns.keys():
         return []

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import ride_name
 from gz_onboard.options import PICTURE_FORMATS
 from gz_onboard.progress import Display, Progress
 from gz_onboard.recording.logs import logs_among
+from gz_onboard.recording.recording import ride_name
 from gz_onboard.reports.results import Failure, distinct_names
 
 

@@ -1,64 +1,17 @@
-"""Tables in memory: what others hand over as signals of a ride, and what a result gives."""
+"""The tables that results give, in memory."""
 
 from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.errors import InputError
-from gz_onboard.offline.cells import rows_of
-from gz_onboard.offline.signal_table import SignalTable, is_time
-
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of one length by the name of the column, with its unit: ``range[m]``."""
-
-# --- in -----------------------------------------------------------------------------------------------------------
-
-
-def signal_table(data: object, name: str = "table") -> SignalTable:
-    """The signals of a ride in a table: a mapping of columns, or a table of pandas, polars, pyarrow or their like.
-
-    The first column is the time, as in a CSV file; of a mapping, the column that is one, wherever it stands; of pandas
-    also the index. name: what errors call it. Raises InputError for what is no table, or has columns of unlike lengths.
-    """
-    columns = _columns(data, name)
-    columns.sort(key=lambda column: not is_time(column[0]))
-    return SignalTable(Path(name), *rows_of(columns, name))
-
-
-def _columns(data: Any, name: str) -> list[tuple[str, object]]:
-    """The columns of a table, each with its name."""
-    if isinstance(data, Mapping):
-        return [(str(header), column) for header, column in data.items()]
-    if hasattr(data, "iloc") and hasattr(data, "columns"):  # pandas, which may have two columns of one name
-        columns = [(str(header), data.iloc[:, i]) for i, header in enumerate(data.columns)]
-        headers = [header for header, _ in columns]
-        if twice := next((header for header in headers if headers.count(header) > 1), None):
-            raise InputError(f"{name}: has two columns {twice!r}")
-        index = str(data.index.name)
-        return [(index, data.index), *columns] if is_time(index) and index not in headers else columns
-    if hasattr(data, "__arrow_c_stream__"):
-        try:
-            import pyarrow
-        except ImportError as error:
-            raise InputError(f"{name}: a {type(data).__name__} needs pyarrow; a dict of arrays does without") from error
-        with suppress(pyarrow.ArrowException, TypeError, ValueError, RuntimeError):  # a column alone speaks Arrow too
-            table = pyarrow.table(data)
-            return list(zip(table.column_names, table.columns, strict=True))
-    raise InputError(
-        f"{name}: {type(data).__name__} is no table of signals; give a dict of arrays by column, or a table of "
-        "pandas, polars or pyarrow"
-    )
-
-
-# --- out ----------------------------------------------------------------------------------------------------------
 
 
 class Tabular(ABC):

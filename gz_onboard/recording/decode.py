@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.can.codec import AHEAD_NS, COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, Codec, MessageDecoder
-from gz_onboard.can.layout import crc_differences, first_bit, is_not_available
+from gz_onboard.can.layout import crc_differences, first_bit, is_not_available, plausible_range
 from gz_onboard.can.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, WINDOW_NS, Pipeline
 from gz_onboard.progress import Progress
-from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.frames import FrameColumns, SignalColumns
 from gz_onboard.recording.timeline import on_timeline, stray
 
 if TYPE_CHECKING:
@@ -87,15 +87,18 @@ class _Decoded:
 
 
 class DecodedLog:
-    """The frames of one log, decoded by columns: either the samples of each role, or windows for the estimator.
+    """A log, decoded by columns: either the samples of each role, or windows for the estimator.
+
+    frames: its frames, or the values of a table of signals.
 
     codec: one that has decoded nothing yet. It is left as if it had decoded all frames one by one: with the faults,
     the frames lost, unknown and copied, the leaps of the clock, the latest frames and the origins of the messages.
     Times are since the first frame. odd: mask of frames whose time is wrong, which are not decoded.
     """
 
-    def __init__(self, frames: FrameColumns, codec: Codec, odd: Mask | None = None) -> None:
-        self.frames, self.codec = frames, codec
+    def __init__(self, frames: FrameColumns | SignalColumns, codec: Codec, odd: Mask | None = None) -> None:
+        self.frames = frames if isinstance(frames, FrameColumns) else FrameColumns.of([])
+        self.codec, self._time_ns = codec, frames.time_ns
         self._odd = np.zeros(len(frames), bool) if odd is None else odd
         timed = np.flatnonzero(~self._odd)
         is_kept, self._passed_ns = np.zeros(len(frames), bool), np.zeros(len(frames), np.int64)
@@ -111,7 +114,10 @@ class DecodedLog:
         self._good: dict[str, Rows] = {}  # by message
         self._decoded: list[_Decoded] = []
         self._one_by_one: Rows = np.zeros(0, np.int64)
-        self._decode(kept)
+        if isinstance(frames, FrameColumns):
+            self._decode(kept)
+        else:
+            self._take_table(frames, kept)
         self._origin_ns = codec.origin_ns
 
     def samples(self) -> dict[str, Column]:
@@ -126,7 +132,7 @@ class DecodedLog:
         found |= self._samples_one_by_one()
         for counts, key, _, numbers in self._events:
             counts[key] = counts.get(key, 0) + int(numbers.sum())
-        self.see_latest(len(self.frames))
+        self.see_latest(len(self._time_ns))
         return {role: found[role] for group in self.codec.groups for role in group.roles if role in found}
 
     def steps(self) -> Iterator[LogWindow]:
@@ -153,7 +159,7 @@ class DecodedLog:
             if end == len(now):  # a window that has not ended
                 break
             windows += decoded.get(window, [])
-            clock_ns = int(self.frames.time_ns[end - 1] - self._passed_ns[end - 1])
+            clock_ns = int(self._time_ns[end - 1] - self._passed_ns[end - 1])
             paused = now[end] - now[end - 1] > _LONGEST_GAP_NS
             for ended in range(window, window + 1 if paused else int(number[end])):
                 end_ns = TICK_NS + ended * WINDOW_NS
@@ -195,6 +201,19 @@ class DecodedLog:
         return found
 
     # --- decoding ---------------------------------------------------------------------------------------------
+
+    def _take_table(self, signals: SignalColumns, rows: Rows) -> None:
+        """Take the values of a table in these rows, which are decoded already."""
+        for number, group in enumerate(self.codec.groups):
+            those = rows[signals.group[rows] == number]
+            raw, columns = signals.value[those], []
+            for source in (source for source in self.codec.mapping.sources if source.signal == group.message):
+                low, high = plausible_range(source, -math.inf, math.inf)
+                real = (raw >= low) & (raw <= high)
+                self._count(self.codec.faults, (source.signal, RANGE), those[~real])
+                columns.append(_RawColumn(source, raw, real))
+            if len(those):
+                self._decoded.append(_Decoded(number, those, self._passed_ns[those], columns))
 
     def _decode(self, rows: Rows) -> None:
         """Decode the frames in these rows, as far as it can be done by columns."""
@@ -281,12 +300,12 @@ class DecodedLog:
         return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
 
-def decode_columns(frames: FrameColumns, codec: Codec, odd: Mask | None = None) -> dict[str, Column]:
+def decode_columns(frames: FrameColumns | SignalColumns, codec: Codec, odd: Mask | None = None) -> dict[str, Column]:
     """Decode `frames`: see `DecodedLog.samples`."""
     return DecodedLog(frames, codec, odd).samples()
 
 
-def feed(pipeline: Pipeline, frames: FrameColumns, progress: Progress | None = None) -> None:
+def feed(pipeline: Pipeline, frames: FrameColumns | SignalColumns, progress: Progress | None = None) -> None:
     """Take all frames of a log through a new `pipeline`, in the windows of the daemon.
 
     Of the status frames that the daemon sends, only those at the end of a window are made. progress: called with

@@ -118,4 +118,19 @@ class FrameColumns:
             yield self[start : start + BATCH].tuples()
 
 
+@dataclass(frozen=True, eq=False)
+class SignalColumns:
+    """The n values of a table of signals, in the order of its rows.
+
+    group: of each, which of the `BusMapping.groups` it belongs to; value: in the unit of its column.
+    """
+
+    time_ns: NDArray[np.int64]
+    group: NDArray[np.int64]
+    value: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
 _SCALARS = ("time_ns", "identifier", "channel", "length")

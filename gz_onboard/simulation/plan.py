@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from gz_onboard.arguments import check_fields
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.offline.arguments import check_fields
-from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
+from gz_onboard.recording.recording import facts_of, ride_name, rider_mass
 from gz_onboard.routes.route import Route, read_route, speed_profile
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table, straight

@@ -23,11 +23,11 @@ from gz_onboard.model.battery import discharged
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import standing_load
 from gz_onboard.offline.arrays import block_means, held_at, running_mean
-from gz_onboard.offline.samples import open_ride, read_samples, ride_name
 from gz_onboard.offline.sensors import speed_role, true_columns
 from gz_onboard.offline.series import first_soc
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed
+from gz_onboard.recording.recording import open_ride, read_recording, ride_name
 from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
@@ -107,7 +107,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     """
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
-    columns = true_columns(read_samples(log, vehicle, progress).columns, vehicle.parameters)
+    columns = true_columns(read_recording(log, vehicle, progress).columns, vehicle.parameters)
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
     headings: list[tuple[float, float]] = []
     rough: list[tuple[float, float, float]] = []  # time, distance, vibration

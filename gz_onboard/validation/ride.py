@@ -20,9 +20,9 @@ from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.model.battery import discharged
 from gz_onboard.offline.arrays import block_means, running_mean
 from gz_onboard.offline.processes import Task
-from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.offline.series import curve_over
 from gz_onboard.progress import Progress
+from gz_onboard.recording.recording import facts_of, ride_name, rider_mass
 from gz_onboard.simulation.parts import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.plan import ridden_road, route_file
 from gz_onboard.simulation.recorded import Recorded, read_recorded, rest_soc, scooter_at_start

@@ -19,8 +19,8 @@ from gz_onboard.can.requests import NEGATIVE
 from gz_onboard.estimation.ride import PAUSE_S
 from gz_onboard.estimator.signals import TIMING
 from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
-from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.recording.frames import FrameColumns
+from gz_onboard.recording.recording import Recording, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.reports.results import clock, leap_text
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check import charge, electric, motion, others
@@ -75,8 +75,8 @@ def check_log(
     columns = read_roles(log, vehicle, codec, frames)
     if progress:
         progress(len(frames))
-    lengths = _last_lengths(frames)
-    samples = Samples(ride_name(log), columns, facts_of(log))
+    lengths = _last_lengths(frames) if isinstance(frames, FrameColumns) else {}
+    samples = Recording(ride_name(log), columns, facts_of(log))
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += _never_came(codec, columns, lengths, _passed(columns)[0])
     findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
@@ -234,7 +234,7 @@ def _unless_at_a_wrong_speed(off: bool, findings: Iterable[Finding]) -> list[Fin
 def _roles(
     mapping: BusMapping,
     groups: Sequence[Group],
-    samples: Samples,
+    samples: Recording,
     span: tuple[float, float],
     findings: Sequence[Finding],
 ) -> list[RoleSeen]:

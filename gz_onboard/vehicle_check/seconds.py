@@ -12,8 +12,8 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.can.mapping import UNITS, known_units, to_si
 from gz_onboard.discovery.grid import averaged, delays, measured
 from gz_onboard.estimator.plausibility.residual import CONFIG
-from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.sensors import true_columns
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 
 SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each
@@ -45,7 +45,7 @@ class Seconds:
         return [role for role in roles if role in self.columns]
 
 
-def seconds_of(samples: Samples, vehicle: Vehicle) -> Seconds:
+def seconds_of(samples: Recording, vehicle: Vehicle) -> Seconds:
     """The samples of a ride on the grid, the delays and errors of the sensors that the file knows taken off."""
     columns = true_columns(samples.columns, vehicle.parameters)
     late = delays(vehicle)

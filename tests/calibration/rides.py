@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -29,7 +29,7 @@ def ride(
     series=SERIES,
     voltage_gains=(1.0, 1.0),
     drift=0.0,
-) -> Samples:
+) -> Recording:
     """10 Hz: current in steps of 5 s, every third at rest with the brake on; all sensors noisy.
 
     inverter_gain, auxiliary_sign: what those current sensors make of a current. own_loss: of the inverter at rest, as a
@@ -59,4 +59,4 @@ def ride(
         "brake_switch": brake,
         "cell_temperature": np.full(len(time), temperature),
     }
-    return Samples(f"ride_{seed}", {role: (time, values) for role, values in columns.items() if role not in drop})
+    return Recording(f"ride_{seed}", {role: (time, values) for role, values in columns.items() if role not in drop})

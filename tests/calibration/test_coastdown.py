@@ -19,7 +19,7 @@ from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Model
-from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -87,7 +87,7 @@ def plant(seed, trials=1, runs=6, **fixed):
                 "gps_altitude": (time[:2], np.full(2, 250.0)),
             }
             facts: dict[str, object] = {"rider_mass_kg": 75.0, "direction": "up" if way[r] > 0 else "down"}
-            samples.append(Samples(f"run_{r}", columns, facts))
+            samples.append(Recording(f"run_{r}", columns, facts))
         result.append((samples, {name: float(values[i, 0]) for name, values in truth.items()}))
     return result
 
@@ -181,7 +181,7 @@ def test_refused_runs(healthy):
 
 
 def test_the_recorded_coastdown():
-    run = read_samples(LOGS / "coastdown.blf", VEHICLE)
+    run = read_recording(LOGS / "coastdown.blf", VEHICLE)
     rolled = coast(run, VEHICLE, 1)
     assert rolled.speed[0] == pytest.approx(12.4, abs=0.3)
     assert rolled.speed[-1] < 2.5
@@ -194,7 +194,7 @@ def test_commissioning_coastdowns():
     logs = sorted(Path(DATA or "").rglob("commissioning/coastdown_*.blf"))
     if not logs:
         pytest.skip("no coast-downs in GZ_ONBOARD_DATA")
-    found = calibrate([read_samples(log, VEHICLE) for log in logs], VEHICLE)
+    found = calibrate([read_recording(log, VEHICLE) for log in logs], VEHICLE)
     own, still = (fit for fit in found.fits if fit.held_out)
     assert own.largest < 0.3
     assert still.largest < 1.2

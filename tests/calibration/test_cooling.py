@@ -14,7 +14,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.model.model import STOOD
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import read_vehicle
 from tests.support import without_cell_effects
 
@@ -230,13 +230,13 @@ def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
     columns = {role: (fast, np.full(len(fast), value)) for role, value in values.items()}
     columns |= {role: (slow, np.full(len(slow), 25.0)) for role in ("motor_temperature", "ambient_temperature")}
     columns["cell_temperature"] = (slow, np.full(len(slow), 25.0))
-    run = ride_run(Samples("steady", columns), VEHICLE)
+    run = ride_run(Recording("steady", columns), VEHICLE)
     p = VEHICLE.parameters
     iron = p["motor_iron_linear"] * 40 + p["motor_iron_quadratic"] * 1600
     assert np.allclose(run.iron, iron) and not run.bench
     assert np.allclose(run.air, 40 * p["wheel_radius"])
-    assert not ride_run(Samples("closed room", columns), VEHICLE, "none").air.any()
-    assert np.allclose(ride_run(Samples("fan", columns), VEHICLE, 3.0).air, 3.0)
+    assert not ride_run(Recording("closed room", columns), VEHICLE, "none").air.any()
+    assert np.allclose(ride_run(Recording("fan", columns), VEHICLE, 3.0).air, 3.0)
     copper = p["motor_copper_resistance"] * (1 + p["motor_copper_frequency"] * 40**2) * 2500
     assert np.allclose(run.motor_heat, iron + copper, rtol=1e-6)
     cell = (24 - p["pack_current_offset"]) / p["pack_current_gain"] / 12
@@ -251,9 +251,9 @@ def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
     volts = battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell - reaction, 24.0)
     columns["pack_voltage"] = fast, np.full(len(fast), volts)
     heat = bars + 168 * cell * (cell * r0 + reaction)
-    assert ride_run(Samples("low", columns), VEHICLE).pack_heat[0] == pytest.approx(heat, rel=0.02)
+    assert ride_run(Recording("low", columns), VEHICLE).pack_heat[0] == pytest.approx(heat, rel=0.02)
     with pytest.raises(InputError, match="steady: no motor_current"):
-        ride_run(Samples("steady", {k: v for k, v in columns.items() if k != "motor_current"}), VEHICLE)
+        ride_run(Recording("steady", {k: v for k, v in columns.items() if k != "motor_current"}), VEHICLE)
 
 
 @needs_data
@@ -279,7 +279,7 @@ def test_bursts_heat_the_cells_by_what_their_reaction_has_built_up():
     steady = ("motor_temperature", "ambient_temperature", "cell_temperature")
     columns |= {role: (slow, np.full(len(slow), 15.0)) for role in steady}
     with_it, without_it = (
-        ride_run(Samples("bursts", columns), vehicle) for vehicle in (VEHICLE, without_cell_effects(VEHICLE))
+        ride_run(Recording("bursts", columns), vehicle) for vehicle in (VEHICLE, without_cell_effects(VEHICLE))
     )
     effects, joules = CellEffects(VEHICLE.model, VEHICLE.pack), 0.0
     effects.step(VEHICLE.pack, STOOD, 60.0 / 12, 0.5, 15.0)  # such runs are taken to begin under way

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.calibration.wheel import RECEIVER, calibrate
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -17,7 +17,7 @@ VEHICLE = read_vehicle("reference")
 
 def ride(
     radius: float, seed: int, lag: float = 0.4, minutes: float = 10, top: float = 12.0, bias: float = 0.0
-) -> Samples:
+) -> Recording:
     """Stop and go with cruising between; the receiver reports `lag` [s] late, with noise."""
     rng = np.random.default_rng(seed)
     time = np.arange(0, 60 * minutes, 0.05)
@@ -29,7 +29,7 @@ def ride(
         speed[k] = v
     fixes = np.arange(2.0, time[-1], 0.2)
     gps = np.interp(fixes - lag, time, speed) * (1 + bias) + rng.normal(0, 0.05, len(fixes))
-    return Samples(f"ride_{seed}", {"motor_speed": (time, speed / radius), "gps_speed": (fixes, gps)})
+    return Recording(f"ride_{seed}", {"motor_speed": (time, speed / radius), "gps_speed": (fixes, gps)})
 
 
 @settings(max_examples=10, deadline=None)
@@ -51,7 +51,7 @@ def test_its_sd_holds_receivers_that_err():
 
 def test_what_does_not_tell_is_refused():
     good = ride(0.24, 1)
-    blind = Samples("blind", {"motor_speed": good.columns["motor_speed"]})
+    blind = Recording("blind", {"motor_speed": good.columns["motor_speed"]})
     slow = ride(0.24, 2, top=4.0)
     result = calibrate([good, blind, slow], VEHICLE)
     assert result.refusals[0] == "blind: has no gps_speed or no motor_speed, nor a wheel_speed_rear instead"
@@ -66,7 +66,7 @@ def test_without_a_motor_speed_it_is_that_of_the_rear_wheel_and_says_so():
     time, turned = with_motor.columns["motor_speed"]
     columns = {"gps_speed": with_motor.columns["gps_speed"], "wheel_speed_rear": (time, turned)}
     geared = VEHICLE.changed(VEHICLE.parameters.replaced(gear_ratio=0.2))
-    result = calibrate([Samples("car", columns)], geared)
+    result = calibrate([Recording("car", columns)], geared)
     assert result.parameters["wheel_radius"].value == pytest.approx(0.24, rel=0.003)
     assert "car: no motor_speed, taken by wheel_speed_rear instead" in result.notes
     assert "gps_speed over wheel_speed_rear" in result.parameters["wheel_radius"].source

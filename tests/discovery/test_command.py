@@ -12,7 +12,7 @@ from gz_onboard.discovery.judgement import Report
 from gz_onboard.discovery.parameters import candidates
 from gz_onboard.discovery.run import discover
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.reports.results import descriptions
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
@@ -116,7 +116,7 @@ def test_the_report_is_one_file_with_its_pictures(alone: Path):
 
 def test_rides_held_out_by_name_have_no_part_in_anything():
     vehicle = read_vehicle("reference")
-    rides = [read_samples(LOGS / f"city_{name}.blf", vehicle) for name in ("14C", "34C")]
+    rides = [read_recording(LOGS / f"city_{name}.blf", vehicle) for name in ("14C", "34C")]
     found = discover(vehicle, rides, holdout=["city_34C"])
     report = found.report
     assert [line.ride.name for line in found.search.lines] == ["city_14C"]

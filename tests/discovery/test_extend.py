@@ -18,7 +18,7 @@ from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Bound
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.discovery.material import CURVE, KNOTS, cause, cornering, discovered, rolling
 from tests.support import LOGS
@@ -33,7 +33,7 @@ def mixed() -> MixedModel:
 
 @pytest.fixture(scope="module")
 def lines(mixed: MixedModel) -> list[LinearRide]:
-    return linearise_all([mixed.ride(read_samples(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
+    return linearise_all([mixed.ride(read_recording(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
 
 
 def test_causes_become_effects_and_parameters(mixed, lines, tmp_path: Path):

@@ -16,14 +16,14 @@ from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.residuals import pack_power
 from gz_onboard.discovery.run import discover
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant.cases import draw_many
 
 INSIDE = {"motor_current", "motor_torque", "inverter_current", "inverter_voltage", "auxiliary_current"}
 
 
-def without(ride: Samples, *roles: str) -> Samples:
+def without(ride: Recording, *roles: str) -> Recording:
     """The ride as a vehicle without these sensors shows it."""
     return replace(ride, columns={n: c for n, c in ride.columns.items() if n not in roles})
 
@@ -39,7 +39,7 @@ def mixed(scooter: Vehicle) -> MixedModel:
 
 
 @pytest.fixture(scope="module")
-def loaded() -> tuple[Sequence[Samples], float]:
+def loaded() -> tuple[Sequence[Recording], float]:
     """Rides with a hidden load, and its power [W]: to a scooter what 1 kW is to a car."""
     (case,) = draw_many([500_003], "one", ("auxiliary_load",), truths=False)
     return case.rides, case.truths[0].change[0]

@@ -49,9 +49,9 @@ from gz_onboard.discovery.search import one_degree
 from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.model.effect import load_effect, package_effects
 from gz_onboard.model.model import standing_load
-from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.series import all_quantities, total
 from gz_onboard.offline.traits import traits
+from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import LOGS, cell_voltage
 
@@ -70,8 +70,8 @@ def mixed(scooter: Vehicle) -> MixedModel:
 
 
 @pytest.fixture(scope="module")
-def samples(scooter: Vehicle) -> Samples:
-    return read_samples(LOGS / "city_14C.blf", scooter)
+def samples(scooter: Vehicle) -> Recording:
+    return read_recording(LOGS / "city_14C.blf", scooter)
 
 
 # --- the grid -------------------------------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def test_vibration_on_the_grid_is_that_of_the_road_there():
     assert np.median(found[260:390]) == pytest.approx(6 * np.median(found[50:190]), rel=0.2)
 
 
-def test_a_message_may_state_how_old_its_values_are(scooter: Vehicle, samples: Samples):
+def test_a_message_may_state_how_old_its_values_are(scooter: Vehicle, samples: Recording):
     (message,) = {s.message for s in scooter.mapping.sources if s.role == "gps_speed"}
     late = replace(scooter, mapping=replace(scooter.mapping, delays={message: 0.9}))
     usual, later = (known_from(vehicle).ride(samples) for vehicle in (scooter, late))
@@ -148,7 +148,7 @@ def test_sensor_errors_of_the_file_are_corrected_in_start_charge_and_heat(scoote
         "pack_current": amperes * 1.05 + 1.0,
     }
     time = np.arange(0.0, seconds, 0.05)
-    ride = mixed.ride(Samples("made up", {role: (time, np.full(len(time), x)) for role, x in shown.items()}, {}))
+    ride = mixed.ride(Recording("made up", {role: (time, np.full(len(time), x)) for role, x in shown.items()}, {}))
     taken = amperes * STEP * len(ride.time) / (3600 * battery.pack_capacity(cold))
     assert ride.start_soc == pytest.approx(soc, abs=1e-3)
     assert counted_soc(ride, mixed.system)[-1] == pytest.approx(soc - taken, abs=1e-3)
@@ -233,7 +233,7 @@ def test_statistics_are_those_of_generalised_least_squares():
     assert white[:, 0] @ white[:, 1] == pytest.approx(2 * y @ inverse @ y)
 
 
-def test_statistics_move_with_the_parameters_as_residuals_do(mixed: MixedModel, samples: Samples):
+def test_statistics_move_with_the_parameters_as_residuals_do(mixed: MixedModel, samples: Recording):
     (line,) = linearise_all([mixed.ride(samples)], mixed)
     offset = np.random.default_rng(0).normal(size=len(mixed.names))
     moved = line.seen_from(offset)
@@ -242,7 +242,7 @@ def test_statistics_move_with_the_parameters_as_residuals_do(mixed: MixedModel, 
     assert moved.seen_from(-offset).tables["road_force"].y == pytest.approx(line.tables["road_force"].y)
 
 
-def test_linearising_elsewhere_is_seen_from_the_same_place(mixed: MixedModel, samples: Samples):
+def test_linearising_elsewhere_is_seen_from_the_same_place(mixed: MixedModel, samples: Recording):
     """Of a parameter that residuals are linear in, the residuals do not change."""
     offset = np.zeros(len(mixed.names))
     (i,) = mixed.index(["auxiliary_power"])
@@ -272,7 +272,7 @@ def test_noise_is_learned_as_it_was_made():
     assert [*found] == pytest.approx([3.0, 3.0, 60.0], rel=0.1)
 
 
-def test_an_outlier_is_trimmed_with_its_neighbours(mixed: MixedModel, samples: Samples):
+def test_an_outlier_is_trimmed_with_its_neighbours(mixed: MixedModel, samples: Recording):
     times, values = samples.columns["pack_voltage"]
     spoiled = np.where(np.abs(times - times[0] - 300.0) < 1.0, values + 5.0, values)
     ride = replace(samples, columns={**samples.columns, "pack_voltage": (times, spoiled)})
@@ -294,7 +294,7 @@ def test_the_fewer_the_healthy_rides_the_less_a_curve_of_many_coefficients_says(
 # --- curves ---------------------------------------------------------------------------------------------------------
 
 
-def poor(mixed: MixedModel, ride: Samples, **columns: tuple[np.ndarray, np.ndarray]) -> LinearRide:
+def poor(mixed: MixedModel, ride: Recording, **columns: tuple[np.ndarray, np.ndarray]) -> LinearRide:
     """`ride` as one shows it that measured no more than pack and speed, and `columns`."""
     known = {role: ride.columns[role] for role in ("pack_voltage", "pack_current", "motor_speed")}
     (line,) = linearise_all([mixed.ride(replace(ride, columns=known | columns))], mixed)
@@ -308,7 +308,7 @@ def test_forms_are_curves_and_lines_in_proportion():
     assert all(form.basis.shape == (len(form.knots), 1) for form in forms if form.straight)
 
 
-def test_no_curve_over_what_was_not_measured(mixed: MixedModel, samples: Samples):
+def test_no_curve_over_what_was_not_measured(mixed: MixedModel, samples: Recording):
     line = poor(mixed, samples)
     had = {form.quantity for form in curve_forms() if columns_of(line, form) is not None}
     assert had == {"speed", "acceleration", "time", "pack_current", "soc", CONSTANT}
@@ -318,7 +318,7 @@ def test_no_curve_over_what_was_not_measured(mixed: MixedModel, samples: Samples
     assert {"heading", "lateral_acceleration", "grade", "motor_temperature", "current_change"} <= had
 
 
-def test_no_curve_over_what_hardly_varies(mixed: MixedModel, samples: Samples):
+def test_no_curve_over_what_hardly_varies(mixed: MixedModel, samples: Recording):
     """Also between two knots, where both would count as visited."""
     times, course = samples.columns["gps_course"]
     form = curve_form("pack_power", "heading")
@@ -331,7 +331,7 @@ def test_no_curve_over_what_hardly_varies(mixed: MixedModel, samples: Samples):
     assert supported_knots(straight, [stuck, stuck])[0].shape[1] == 0
 
 
-def test_a_knot_that_one_ride_alone_visits_bends_no_curve(mixed: MixedModel, samples: Samples):
+def test_a_knot_that_one_ride_alone_visits_bends_no_curve(mixed: MixedModel, samples: Recording):
     (line,) = linearise_all([mixed.ride(samples)], mixed)
     form = curve_form("road_force", "speed")
     free, weights = supported_knots(form, [line, line])

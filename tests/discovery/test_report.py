@@ -45,7 +45,7 @@ from gz_onboard.discovery.report import (
 )
 from gz_onboard.discovery.search import IMPOSSIBLE, Rejected, Split, search_causes, search_problem
 from gz_onboard.model.parameters import Parameters
-from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.discovery.material import CURVE, cause, discovered, rolling, search_of
 from tests.support import LOGS
@@ -58,12 +58,12 @@ def mixed() -> MixedModel:
 
 
 @pytest.fixture(scope="module")
-def ride(mixed: MixedModel) -> Samples:
-    return read_samples(LOGS / "coastdown.blf", mixed.vehicle)
+def ride(mixed: MixedModel) -> Recording:
+    return read_recording(LOGS / "coastdown.blf", mixed.vehicle)
 
 
 @pytest.fixture(scope="module")
-def line(mixed: MixedModel, ride: Samples) -> LinearRide:
+def line(mixed: MixedModel, ride: Recording) -> LinearRide:
     (line,) = linearise_all([mixed.ride(ride)], mixed)
     return line
 
@@ -202,7 +202,7 @@ def test_an_outlying_ride_is_named(mixed: MixedModel, line: LinearRide):
     assert "coastdown is an outlier" in said and "soc start +1" in said
 
 
-def test_missing_sensors_are_said(mixed: MixedModel, ride: Samples):
+def test_missing_sensors_are_said(mixed: MixedModel, ride: Recording):
     lacking = ("accel_x", "rate_z", "gps_speed", "gps_course", "gps_altitude")
     less = replace(ride, columns={k: v for k, v in ride.columns.items() if k not in lacking})
     now = search_of(mixed, linearise_all([mixed.ride(less)], mixed))
@@ -247,7 +247,7 @@ def wrong() -> Discovery:
     mixed, rides = known_from(vague(scooter)), []
     inside = {"inverter_current", "inverter_voltage", "auxiliary_current", "accel_x", "rate_z", "gps_altitude"}
     for name in ("city_14C", "city_34C"):
-        ride = read_samples(LOGS / f"{name}.blf", scooter)
+        ride = read_recording(LOGS / f"{name}.blf", scooter)
         known = {r: (t[t < 250.0], v[t < 250.0]) for r, (t, v) in ride.columns.items() if r not in inside}
         times, values = known["pack_current"]
         rides.append(mixed.ride(replace(ride, columns=known | {"pack_current": (times, 3.0 * values)})))

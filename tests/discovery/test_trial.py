@@ -30,7 +30,7 @@ from gz_onboard.discovery.judgement import VERDICTS
 from gz_onboard.discovery.mixed_model import LinearRide, MixedModel, Statistics
 from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.search import carries_over, improves, with_observed_scatter, within_bounds, worsened
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.discovery.material import search_of
 from tests.plant import cases as plant
@@ -40,7 +40,7 @@ SCOOTER = FIRST // plant.CASES_OF_A_SCOOTER
 
 
 @pytest.fixture(scope="module")
-def ridden() -> tuple[list[Samples], list[plant.Case]]:
+def ridden() -> tuple[list[Recording], list[plant.Case]]:
     """The healthy rides and the cases: in one batch, which is cheap."""
     healthy, cases = plant.trial([SCOOTER], range(FIRST, FIRST + CASES))
     return healthy[SCOOTER], cases

@@ -11,8 +11,8 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import read_samples
 from gz_onboard.recording.logs import read_frames
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.vehicle import read_vehicle
 from gz_onboard.vehicle_check.check import check_log, check_text
 from tests.can.doctor import complaints
@@ -85,7 +85,7 @@ def restamped(file: Path, time_of: Callable[[int, int], int]) -> Path:
 def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
     log = restamped(tmp_path / "ride.mcap", time_of)
     with pytest.raises(InputError, match=said):
-        read_samples(log, read_vehicle("reference"))
+        read_recording(log, read_vehicle("reference"))
     assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "ride.estimate.mcap").exists()
@@ -110,7 +110,7 @@ def test_a_short_log_in_reverse_is_refused(tmp_path, count):
     log = tmp_path / "ride.log"
     write_log(log, frames[::-1])
     with pytest.raises(InputError, match="its last frame is not after its first; sort its frames by time"):
-        read_samples(log, read_vehicle("reference"))
+        read_recording(log, read_vehicle("reference"))
 
 
 def test_what_a_log_holds_says_that_its_time_runs_back(tmp_path, capsys):
@@ -127,11 +127,11 @@ def test_single_frames_ahead_of_all_others_do_not_move_time(tmp_path, capsys):
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
     assert (ride["clock"], ride["gaps_s"], ride["paused_s"], ride["dropped"]) == ([], 0, 0, 65)
-    samples = read_samples(log, read_vehicle("reference"))
+    samples = read_recording(log, read_vehicle("reference"))
     assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)
     assert all((times[1:] >= times[:-1]).all() for times, _ in samples.columns.values())
 
 
 def test_the_other_tools_read_such_a_log(tmp_path):
-    samples = read_samples(leaping(tmp_path / "leap.mcap", -YEARS), read_vehicle("reference"))
+    samples = read_recording(leaping(tmp_path / "leap.mcap", -YEARS), read_vehicle("reference"))
     assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)

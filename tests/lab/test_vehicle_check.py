@@ -14,7 +14,7 @@ from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
 from gz_onboard.estimator.plausibility.motion import GROUND
-from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import read_vehicle
 from gz_onboard.vehicle_check.charge import check_charge
 from gz_onboard.vehicle_check.check import check_log, check_text, checks_of
@@ -144,7 +144,7 @@ def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):
     vehicle = read_vehicle("reference")
     ground = {role: (t, v * 0.0) for role, (t, v) in rides[0].columns.items() if role in GROUND}
     for standing, stuck in (ground, []), ({"wheel_speed_front": ground["wheel_speed_front"]}, ["wheel_speed_front"]):
-        ride_ = seconds_of(Samples("x", {**rides[0].columns, **standing}), vehicle)
+        ride_ = seconds_of(Recording("x", {**rides[0].columns, **standing}), vehicle)
         found = list(checks_of(ride_, vehicle, None))
         assert [one.roles[0] for one in found if one.check == "stuck"] == stuck
         assert any("a roller bench" in one.text for one in found) is not bool(stuck)
@@ -156,7 +156,7 @@ def test_a_speed_that_is_off_accuses_nothing_else(rides, factor):
     for ride_ in rides:
         times, values = ride_.columns["motor_speed"]
         columns = {**ride_.columns, "motor_speed": (times, values * factor)}
-        found = checks_of(seconds_of(Samples("x", columns), vehicle), vehicle, None)
+        found = checks_of(seconds_of(Recording("x", columns), vehicle), vehicle, None)
         accused = [one for one in found if one.looks is Looks.WRONG]
         assert all("motor_speed" in one.roles for one in accused)
         assert len(accused) == 1 or factor > 0  # of another factor than 1 all other speeds have something to say
@@ -269,11 +269,11 @@ def test_other_vehicles_with_and_without_a_mistake(tmp_path, name):
 
 
 @pytest.fixture(scope="module")
-def rides() -> list[Samples]:
-    return [read_samples(LOGS / name, read_vehicle("reference")) for name in ("city_34C.blf", "turning/oval_2C.blf")]
+def rides() -> list[Recording]:
+    return [read_recording(LOGS / name, read_vehicle("reference")) for name in ("city_34C.blf", "turning/oval_2C.blf")]
 
 
-def elsewhere(ride: Samples, latitude: float, longitude: float) -> dict[str, tuple[Array, Array]]:
+def elsewhere(ride: Recording, latitude: float, longitude: float) -> dict[str, tuple[Array, Array]]:
     """The columns of `ride` as if it had been ridden at another place [deg], as long to the north and the east."""
     north, east = ride.columns["latitude"], ride.columns["longitude"]
     wider = np.cos(np.radians(north[1].mean())) / np.cos(np.radians(latitude))
@@ -289,7 +289,7 @@ def said_of_positions(columns: dict[str, tuple[Array, Array]], scale: float) -> 
     vehicle = read_vehicle("reference")
     kept = {role: columns[role] for role in ("motor_speed", "latitude", "longitude")}
     kept["motor_speed"] = kept["motor_speed"][0], kept["motor_speed"][1] * scale
-    ride = seconds_of(Samples("x", kept), vehicle)
+    ride = seconds_of(Recording("x", kept), vehicle)
     found = check_distances(ride, speeds_of(ride, vehicle), frozenset())
     return [one for one in found if {"latitude", "longitude"} <= set(one.roles)]
 
@@ -324,7 +324,7 @@ def test_a_latitude_beyond_the_poles_needs_no_ride(rides):
 # --- wheel radius and gear ratio ----------------------------------------------------------------------------------
 
 
-def by_another(ride: Samples, folder: Path, times: dict[str, float], **scales: float) -> list[Finding]:
+def by_another(ride: Recording, folder: Path, times: dict[str, float], **scales: float) -> list[Finding]:
     """What is said of radius and gear ratio where the file has those parameters `times` theirs, and sensors `scales`.
 
     A sensor of scale 0 is not there.
@@ -337,7 +337,7 @@ def by_another(ride: Samples, folder: Path, times: dict[str, float], **scales: f
     (folder / "v.toml").write_text(text, encoding="utf-8")
     vehicle = read_vehicle(folder / "v.toml")
     kept = {role: (t, v * scales.get(role, 1.0)) for role, (t, v) in ride.columns.items() if scales.get(role, 1.0)}
-    seconds = seconds_of(Samples("x", kept), vehicle)
+    seconds = seconds_of(Recording("x", kept), vehicle)
     return rolling_of(seconds, speeds_of(seconds, vehicle), vehicle).findings
 
 
@@ -369,7 +369,7 @@ def test_a_radius_that_only_the_odometer_doubts_cannot_be_told(rides, times, loo
     vehicle = read_vehicle("reference")
     radius = vehicle.parameters["wheel_radius"]
     seen = {role: values for role, values in rides[0].columns.items() if not role.startswith(("gps", "lat", "long"))}
-    ride_ = seconds_of(Samples("x", seen), vehicle)
+    ride_ = seconds_of(Recording("x", seen), vehicle)
     speeds = {role: speed * times for role, speed in speeds_of(ride_, vehicle).items()}
     (said,) = check_distances(ride_, speeds, frozenset(), radius * times)
     assert said.looks is looks, said
@@ -399,7 +399,7 @@ def test_with_a_radius_that_fits_the_rest_of_the_check_is_as_it_was(log, tmp_pat
 # --- the pack -----------------------------------------------------------------------------------------------------
 
 
-def said_of_the_pack(ride: Samples, folder: Path, was: str, now: str) -> dict[str, Finding]:
+def said_of_the_pack(ride: Recording, folder: Path, was: str, now: str) -> dict[str, Finding]:
     """The last finding of each check of voltage, current and charge, with one line of the file changed."""
     text = re.sub(was, now, REFERENCE, flags=re.M)
     assert text != REFERENCE
@@ -465,7 +465,7 @@ def test_no_number_of_cells_fits_a_sensor_that_is_off(rides, role, scale, offset
     for ride_ in rides:
         times, values = ride_.columns[role]
         columns = {**ride_.columns, role: (times, values * scale + offset)}
-        found = unless_contradicted(checks_of(seconds_of(Samples("x", columns), vehicle), vehicle, None))
+        found = unless_contradicted(checks_of(seconds_of(Recording("x", columns), vehicle), vehicle, None))
         assert any(one.looks is Looks.WRONG and role in one.roles for one in found)
         assert [one.text for one in found if "in series would fit" in one.text] == []
 

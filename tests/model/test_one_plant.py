@@ -22,8 +22,8 @@ from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.model.functions import Mesh, PiecewiseLinear
 from gz_onboard.model.model import air_density
 from gz_onboard.offline.arrays import block_means
-from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import FirstOrderPack, Rider
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.validation.components import battery_voltage, components, losses, road_load
@@ -51,7 +51,7 @@ def simulated():
 
 def recorded():
     """The same of a recorded one."""
-    ride = initial(VEHICLE).ride(read_samples(LOG, VEHICLE))
+    ride = initial(VEHICLE).ride(read_recording(LOG, VEHICLE))
     names = ("pack_current", "motor_current", "pack_voltage", "motor_temperature")
     found = {name: block_means(ride.signals[name], 10) for name in names}
     return found | {name: block_means(ride.quantities[name], 10) for name in ("speed", "cell_temperature")}

@@ -1,6 +1,6 @@
 """A scooter that is not the package's model: rides to be found out, drawn by seed, with their truth.
 
-Its own equations, its own integrator, its own sensors; of the package it knows only `Samples`, the form of a ride.
+Its own equations, its own integrator, its own sensors; of the package it knows only `Recording`, the form of a ride.
 """
 
 from tests.plant.cases import Case, Truth, commissioning, commissioning_many, draw, draw_many, healthy, trial

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from tests.plant.machine import Machine, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
 from tests.plant.roads import KINDS as ROADS
@@ -118,9 +118,9 @@ class Case:
     scooter: int
     kind: str
     truths: tuple[Truth, ...]
-    rides: list[Samples]
+    rides: list[Recording]
     accepted: tuple[str, ...] = ()  # of look-alikes: the set that is a right answer too
-    twins: list[Samples] = field(default_factory=list)  # the same rides with nothing hidden: what an oracle has left
+    twins: list[Recording] = field(default_factory=list)  # the same rides with nothing hidden: what an oracle has left
 
 
 @dataclass
@@ -320,7 +320,7 @@ def trial(
     kind: str | None = None,
     names: tuple[str, ...] | None = None,
     truths: bool = True,
-) -> tuple[dict[int, list[Samples]], list[Case]]:
+) -> tuple[dict[int, list[Recording]], list[Case]]:
     """The healthy rides of the scooters `numbers` and the cases of `seeds`, ridden in one batch: that is cheap.
 
     `kind` and `names` overrule what the seed would draw. Every case is ridden again without each of its effects, for
@@ -350,7 +350,7 @@ def draw(seed: int) -> Case:
     return draw_many([seed])[0]
 
 
-def windy(seed: int, speed: float) -> list[Samples]:
+def windy(seed: int, speed: float) -> list[Recording]:
     """Rides of the healthy scooter of `seed` on windy days [m/s], each with a wind from elsewhere."""
     machine = scooter(seed // CASES_OF_A_SCOOTER)
     plans = _service_plans(_draft(seed, "healthy"))
@@ -412,12 +412,12 @@ def _commissioning_runs(number: int) -> list[Run]:
     return [(own, scooter(number), Hidden()) for own in plans]
 
 
-def commissioning_many(numbers: Sequence[int]) -> list[list[Samples]]:
+def commissioning_many(numbers: Sequence[int]) -> list[list[Recording]]:
     """The healthy rides of several scooters."""
     return list(trial(numbers, ())[0].values())
 
 
-def commissioning(number: int) -> list[Samples]:
+def commissioning(number: int) -> list[Recording]:
     """Ten healthy rides of the scooter `number`: all kinds of road, 1 to 33 degC, five riders."""
     return commissioning_many([number])[0]
 
@@ -481,7 +481,7 @@ def _first_runs(number: int) -> list[Run]:
     ]
 
 
-def healthy(number: int, seeds: Sequence[int]) -> tuple[list[Samples], list[list[Samples]]]:
+def healthy(number: int, seeds: Sequence[int]) -> tuple[list[Recording], list[list[Recording]]]:
     """The first eight rides of the scooter `number`, and a later set of rides for each of `seeds`; nothing is wrong."""
     first, later = _first_runs(number), [_strange_runs(number, seed) for seed in seeds]
     ridden = iter(_ride_all([run for runs in (first, *later) for run in runs]))

@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 from numpy.typing import NDArray
 
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 
 DBC = Path(__file__).parents[2] / "dbc"
 DEGREE, REVOLUTION, BAR = np.pi / 180, 2 * np.pi, 1e5
@@ -75,7 +75,7 @@ def _raw(signal: Signal, values: NDArray[np.float64], unit: float) -> Words:
     return (raw & ((1 << signal.length) - 1)).astype(np.uint64) << np.uint64(signal.start)
 
 
-def _frames(message: Message, ride: Samples) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
+def _frames(message: Message, ride: Recording) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
     """Times and data (a row for each frame) of one message; None if the ride has none of its signals."""
     ours = [s for s in message.signals if s.name in SIGNALS and SIGNALS[s.name][0] in ride.columns]
     if not ours:
@@ -100,7 +100,7 @@ def _frames(message: Message, ride: Samples) -> tuple[NDArray[np.float64], NDArr
     return times, data[:, : message.length]
 
 
-def write_log(ride: Samples, file: Path) -> None:
+def write_log(ride: Recording, file: Path) -> None:
     """Write `ride` as frames to `file` (any format of python-can by its suffix)."""
     sent = []
     for name in ("vehicle.dbc", "hbm.dbc"):
@@ -117,7 +117,7 @@ def write_log(ride: Samples, file: Path) -> None:
             )
 
 
-def write_logs(rides: Sequence[Samples], folder: Path) -> list[Path]:
+def write_logs(rides: Sequence[Recording], folder: Path) -> list[Path]:
     """Write `rides` as NAME.blf into `folder`, and what is noted about them into rides.json."""
     files = []
     for ride in rides:

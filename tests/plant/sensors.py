@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
-from gz_onboard.offline.samples import Samples
+from gz_onboard.recording.recording import Recording
 from tests.plant.cells import curve
 from tests.plant.machine import PARALLEL, SERIES, G
 from tests.plant.ride import STEP, Ridden
@@ -29,7 +29,7 @@ GROUPS = 0.002, 0.004, 0.02, 0.0015
 GROUP_NOISE = 0.0007
 
 
-def measure(ridden: Ridden, name: str, cells: bool = False) -> Samples:
+def measure(ridden: Ridden, name: str, cells: bool = False) -> Recording:
     """The ride as its log would give it; with `cells` the monitor tells lowest and highest voltage of the groups."""
     rng = np.random.default_rng([ridden.plan.seed, 83])
     c, m, h = ridden.columns, ridden.machine, ridden.hidden
@@ -148,7 +148,7 @@ def measure(ridden: Ridden, name: str, cells: bool = False) -> Samples:
         "rider_mass_kg": ridden.plan.rider.mass,
         "ambient_C": round(ridden.plan.ambient + float(rng.normal(0, 0.7)), 1),
     }
-    return Samples(name, out, facts)
+    return Recording(name, out, facts)
 
 
 def _groups(ridden: Ridden, times: Array, at: Callable[[NDArray[np.float32], float], Array]) -> Array:

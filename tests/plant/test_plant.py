@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.events import ROLES
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from tests.plant.cases import EFFECTS, RIDES, UNKNOWN, _draft
 from tests.plant.logs import write_logs
 from tests.plant.machine import G, scooter
@@ -41,7 +41,7 @@ def test_it_knows_of_the_package_nothing_but_the_form_of_a_ride():
                     names |= {alias.name for alias in node.names}
     assert {name for name in names if name.startswith("gz_onboard")} == {
         "gz_onboard.arrays",  # a type
-        "gz_onboard.offline.samples",
+        "gz_onboard.recording.recording",
     }
 
 
@@ -109,7 +109,7 @@ def test_sensors_lie_as_told():
 def test_a_log_of_it_reads_back_as_it_is(tmp_path, healthy):
     sent = measure(healthy[0], "ride_000", cells=True)
     (file,) = write_logs([sent], tmp_path)
-    read = read_samples(file, with_cell_voltages(tmp_path))
+    read = read_recording(file, with_cell_voltages(tmp_path))
     assert read.facts == sent.facts
     assert set(read.columns) == set(sent.columns)
     assert set(sent.columns) >= set(ROLES) - {"vehicle_speed", "heater_power", "air_conditioner_power", "key", "rider"}

@@ -15,7 +15,7 @@ from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
 from gz_onboard.discovery.grid import vibration as of_samples
 from gz_onboard.model.effect import MOVING, load_effect
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
@@ -132,7 +132,7 @@ def recorded(folder: Path) -> Recorded:
 
 def test_of_a_recorded_ride_it_is_what_the_accelerometer_shows(recorded: Recorded):
     found = recorded.signals["vibration"]
-    samples = read_samples(RIDE, BASE)
+    samples = read_recording(RIDE, BASE)
     began = samples.columns["motor_speed"][0][0]
     shown = of_samples(*samples.columns["accel_z"], began + STEP * np.arange(len(found)))
     settled = slice(700, None)

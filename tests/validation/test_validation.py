@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from gz_onboard.cli import main
 from gz_onboard.model.model import Model
 from gz_onboard.offline.arrays import block_means
-from gz_onboard.offline.samples import read_samples
+from gz_onboard.recording.recording import read_recording
 from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.validation.command import KEYS
 from gz_onboard.validation.comparison import CHANNELS, LABELS, ORDER, Comparison, pool, pooled, riding_conditions
@@ -159,7 +159,7 @@ def test_a_wrong_parameter_shows_in_its_component(city, component, change):
 
 def test_measured_current_is_corrected_for_the_sensor(city):
     recorded, p = city.recorded, city.vehicle.parameters
-    columns = read_samples(LOGS / "city_34C.blf", city.vehicle).columns
+    columns = read_recording(LOGS / "city_34C.blf", city.vehicle).columns
     grid = np.arange(columns["motor_speed"][0][0], columns["motor_speed"][0][-1], recorded.dt)
     raw = block_means(np.interp(grid, *columns["pack_current"]), 100)
     flows = per_second(recorded)["pack_current"]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import gzip
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,8 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.can.codec import Codec
 from gz_onboard.errors import InputError
-from gz_onboard.offline.samples import Samples, open_ride, read_samples
 from gz_onboard.recording.logs import read_frames
-from gz_onboard.recording.logs import read_samples as logged_samples
+from gz_onboard.recording.recording import Recording, open_ride, read_recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import events_of
 from tests.support import write_log
@@ -32,12 +29,12 @@ RIDE = """time [s],pack_voltage [V],pack_current [mA],speed [km/h],cell_temperat
 """
 
 
-def samples_of(folder: Path, text: str, name: str = "ride.csv", vehicle: object = REFERENCE) -> Samples:
+def samples_of(folder: Path, text: str, name: str = "ride.csv", vehicle: Vehicle = REFERENCE) -> Recording:
     (folder / name).write_text(text, encoding="utf-8")
-    return read_samples(folder / name, vehicle)  # type: ignore[arg-type]
+    return read_recording(folder / name, vehicle)
 
 
-def plain(samples: Samples) -> dict[str, tuple[list[float], list[float]]]:
+def plain(samples: Recording) -> dict[str, tuple[list[float], list[float]]]:
     return {
         role: (times.tolist(), [round(value, 9) for value in values.tolist()])
         for role, (times, values) in samples.columns.items()
@@ -57,18 +54,12 @@ def test_columns_play_the_roles_of_their_names_in_si_and_empty_cells_are_missing
     assert plain(samples_of(tmp_path, RIDE)) == EXPECTED
 
 
-def test_columns_of_nothing_behind_the_last_are_passed_over(tmp_path):
-    assert plain(samples_of(tmp_path, RIDE.replace("\n", ",, \n"))) == EXPECTED
-    with pytest.raises(InputError, match=r"ride\.csv:1: column '' is no role"):
-        samples_of(tmp_path, RIDE.replace("\n", ",7\n").replace("plug,7", "plug,"))
-
-
 def test_semicolons_with_decimal_commas_and_other_encodings_and_packed(tmp_path):
     assert plain(samples_of(tmp_path, RIDE.replace(",", "\t"))) == EXPECTED
     text = RIDE.replace(",", ";").replace(".", ",")
     file = tmp_path / "ride.csv.gz"
     file.write_bytes(gzip.compress(text.encode("cp1252")))
-    assert plain(read_samples(file, REFERENCE)) == EXPECTED
+    assert plain(read_recording(file, REFERENCE)) == EXPECTED
 
 
 @pytest.mark.parametrize(
@@ -105,7 +96,7 @@ def test_parquet(tmp_path, monkeypatch):
     }
     file = tmp_path / "ride.parquet"
     pq.write_table(pa.table(columns), file)
-    assert plain(read_samples(file, REFERENCE)) == EXPECTED
+    assert plain(read_recording(file, REFERENCE)) == EXPECTED
     with pytest.raises(InputError, match="a table of signals"):
         list(read_frames(file))
     for zone in ("Europe/Berlin", "Mars/Olympus"):  # a zone is how the time is written, not what it is
@@ -115,10 +106,10 @@ def test_parquet(tmp_path, monkeypatch):
         assert frames.time_ns[0] == 10 * 10**9
     pq.write_table(pa.Table.from_arrays([*columns.values(), pa.array([1, 2, 3])], [*columns, "pack_voltage[V]"]), file)
     with pytest.raises(InputError, match=r"ride\.parquet:1: two columns are called 'pack_voltage'"):
-        read_samples(file, REFERENCE)
+        read_recording(file, REFERENCE)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"ride\.parquet: Parquet needs pyarrow"):
-        read_samples(file, REFERENCE)
+        read_recording(file, REFERENCE)
 
 
 @pytest.mark.parametrize(
@@ -199,14 +190,14 @@ def test_its_roles_are_checked(tmp_path, without_dbc):
 def test_frames_cannot_be_read_and_the_daemon_does_not_start(tmp_path, without_dbc):
     (tmp_path / "ride.log").write_text("(1.0) can0 123#00\n")
     with pytest.raises(InputError, match=r"mine\.toml: dbc is missing.*ride\.log"):
-        read_samples(tmp_path / "ride.log", read_vehicle(without_dbc))
+        read_recording(tmp_path / "ride.log", read_vehicle(without_dbc))
     assert cli.main(["run", "--vehicle", str(without_dbc), "--interface", "virtual", "--state-dir", ""]) == 2
 
 
 def test_frames_without_times_are_no_ride(tmp_path):
     (tmp_path / "ride.log").write_text("  can0  120   [1]  11\n  can0  121   [1]  11\n")
     with pytest.raises(InputError, match=r"ride\.log: its frames have no times"):
-        read_samples(tmp_path / "ride.log", REFERENCE)
+        read_recording(tmp_path / "ride.log", REFERENCE)
 
 
 # --- the commands -------------------------------------------------------------------------------------------------
@@ -222,15 +213,14 @@ def estimate(tmp_path: Path, *arguments: object) -> dict[str, float]:
 
 def test_estimate_of_a_trip_of_a_vehicle_without_dbc(tmp_path, without_dbc, capsys):
     (tmp_path / "trip.csv").write_text(TRIP)
-    ride = estimate(tmp_path, "--vehicle", without_dbc, "--signals", tmp_path / "trip.csv")
+    ride = estimate(tmp_path, "--vehicle", without_dbc, tmp_path / "trip.csv")
     assert ride["distance_km"] == pytest.approx(1.19, abs=0.02)
     assert ride["energy_wh"] == pytest.approx(109 * 11 * 119.5 / 3600, rel=0.02)
     assert ride["frames"] == 3 * 240
-    topics = {topic for topic, _, _ in logged_samples(tmp_path / "trip.estimate.mcap")}
-    assert topics == {"/estimate", "/status", "/why", "/range_change", "/can/v_kmh", "/can/U", "/can/i"}
-    arguments = ["estimate", "--vehicle", str(without_dbc), "--frames", "--output", str(tmp_path)]
-    assert cli.main([*arguments, str(tmp_path / "trip.csv")]) == 2
-    assert "--frames has nothing to log" in capsys.readouterr().err
+    for option in "--frames", "--signals":
+        arguments = ["estimate", "--vehicle", str(without_dbc), option, "--output", str(tmp_path)]
+        assert cli.main([*arguments, str(tmp_path / "trip.csv")]) == 2
+        assert f"{option} has nothing to log" in capsys.readouterr().err
 
 
 def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
@@ -260,28 +250,6 @@ def test_a_csv_that_is_neither_is_told_how_a_table_begins(tmp_path, text):
     (tmp_path / "ride.csv").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"ride\.csv:1: neither .* nor a table .*UTF-8.*'time \[s\]'.*begins with '"):
         open_ride(tmp_path / "ride.csv", REFERENCE)
-
-
-def test_logs_of_frames_and_tables_are_told_apart_in_the_errors_of_replay(tmp_path, capsys):
-    (tmp_path / "ride.csv").write_text(RIDE)
-    assert cli.main(["export", str(tmp_path / "ride.csv"), str(tmp_path / "out.log")]) == 2
-    assert "is a table of signals, not a log of frames" in capsys.readouterr().err
-
-
-def test_the_trips_of_a_car_have_the_way_and_energy_of_their_index(tmp_path, without_dbc):
-    folder = Path(os.environ.get("GZ_ONBOARD_DATA", "nowhere")) / "real" / "ev_bmw_i3_trips"
-    if not folder.is_dir():
-        pytest.skip("GZ_ONBOARD_DATA names no folder with real/ev_bmw_i3_trips")
-    text = without_dbc.read_text(encoding="utf-8")
-    pack = 'pack_voltage = { signal = "v_batt_V", unit = "V" }'
-    without_dbc.write_text(text.replace('pack_voltage = "U"', pack).replace('"i"', '"i_batt_A"'), encoding="utf-8")
-    for row in list(csv.DictReader((folder / "INDEX.csv").open()))[:5]:
-        columns = read_samples(folder / f"{row['trip']}_2hz.csv.gz", read_vehicle(without_dbc)).columns
-        time, volts = columns["pack_voltage"]
-        power = volts * np.interp(time, *columns["pack_current"])
-        assert np.trapezoid(power, time) / 3.6e6 == pytest.approx(float(row["e_batt_kWh"]), rel=0.01)
-        speed = columns["vehicle_speed"]
-        assert np.trapezoid(speed[1], speed[0]) / 1000 == pytest.approx(float(row["km"]), rel=0.01)
 
 
 def steady(tmp_path: Path, step: float, speed: float = 36.0) -> dict[str, Any]:
@@ -339,7 +307,7 @@ def other_vehicle(file: Path, roles: str, table: str = "") -> Vehicle:
 def test_the_vehicle_file_names_the_column_of_times(tmp_path, without_dbc, time):
     (tmp_path / "trip.csv").write_text(OTHERS)
     vehicle = other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n")
-    found = read_samples(tmp_path / "trip.csv", vehicle).columns
+    found = read_recording(tmp_path / "trip.csv", vehicle).columns
     assert {role: (list(times - times[0]), values[0]) for role, (times, values) in found.items()} == {
         "pack_voltage": ([0, 5, 10], 385.3),
         "ambient_temperature": ([0, 5, 10], 21),
@@ -350,7 +318,7 @@ def test_the_vehicle_file_names_the_column_of_times(tmp_path, without_dbc, time)
         bad = other_vehicle(
             without_dbc, OTHERS_ROLES, '[table]\ntime = { column = "epoch time", format = "%d.%m.%Y" }\n'
         )
-        read_samples(tmp_path / "trip.csv", bad)
+        read_recording(tmp_path / "trip.csv", bad)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +332,7 @@ def test_the_vehicle_file_names_the_column_of_times(tmp_path, without_dbc, time)
 def test_a_column_of_times_that_is_not_there_or_has_no_unit_is_refused(tmp_path, without_dbc, time, said):
     (tmp_path / "trip.csv").write_text(OTHERS.replace("Date/Time", "time [s]"))
     with pytest.raises(InputError, match=said):
-        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n"))
+        read_recording(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n"))
 
 
 @pytest.mark.parametrize("dates", [["06/13/2017 7:47:00", None], [1, 2]])
@@ -376,31 +344,15 @@ def test_dates_of_parquet_are_those_of_the_format_or_refused(tmp_path, without_d
     vehicle = other_vehicle(without_dbc, '\npack_voltage = { signal = "U", unit = "V" }\n', form)
     pq.write_table(pa.table({"when": dates, "U": [50.0, 51.0]}), tmp_path / "ride.parquet")
     with pytest.raises(InputError, match=r"ride.parquet:\d: when: .* is no date of the format"):
-        read_samples(tmp_path / "ride.parquet", vehicle)
+        read_recording(tmp_path / "ride.parquet", vehicle)
     moments = pa.array([10**9, 2 * 10**9], pa.timestamp("ns", "UTC"))
     pq.write_table(pa.table({"when": moments, "U": [50.0, 51.0]}), tmp_path / "ride.parquet")
-    assert set(read_samples(tmp_path / "ride.parquet", vehicle).columns) == {"pack_voltage"}
-
-
-def test_a_column_of_times_may_have_any_letters_and_is_there_once(tmp_path, without_dbc):
-    table = '[table]\ntime = { column = "Zeit für", unit = "s" }\n'
-    vehicle = other_vehicle(without_dbc, '\npack_voltage = { signal = "U", unit = "V" }\n', table)
-    (tmp_path / "ride.csv").write_text("U,Zeit für\n50,1\n51,2\n", encoding="utf-8")
-    assert set(read_samples(tmp_path / "ride.csv", vehicle).columns) == {"pack_voltage"}
-    (tmp_path / "ride.csv").write_text("U,Zeit für,Zeit für\n50,1,7\n51,2,8\n", encoding="utf-8")
-    with pytest.raises(InputError, match="two columns are called 'Zeit für'"):
-        read_samples(tmp_path / "ride.csv", vehicle)
-
-
-def test_a_table_whose_time_no_one_names_says_how_to(tmp_path, without_dbc):
-    (tmp_path / "trip.csv").write_text(OTHERS)
-    with pytest.raises(InputError, match=r"\[table\] time = \{ column"):
-        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES))
+    assert set(read_recording(tmp_path / "ride.parquet", vehicle).columns) == {"pack_voltage"}
 
 
 def test_two_columns_of_one_name_matter_only_to_a_role_that_names_them(tmp_path, without_dbc):
     (tmp_path / "trip.csv").write_text(OTHERS.replace("epoch time", "time [s]"))
-    assert len(read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES)).columns) == 4
+    assert len(read_recording(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES)).columns) == 4
     asked = f'{OTHERS_ROLES}air_conditioner_power = "AC Power"\n'
     with pytest.raises(InputError, match=r"trip\.csv:1: two columns are called 'AC Power'"):
-        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, asked))
+        read_recording(tmp_path / "trip.csv", other_vehicle(without_dbc, asked))

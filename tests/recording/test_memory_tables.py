@@ -1,9 +1,8 @@
-"""Columns in memory, of whatever library: what they become as frames, or the error that names column and row."""
+"""Columns in memory, of whatever library: the values in them, or the error that names column and row."""
 
 from __future__ import annotations
 
 import datetime
-import struct
 from collections.abc import Callable
 from decimal import Decimal
 from typing import Any
@@ -13,8 +12,7 @@ import pyarrow as pa
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.signal_table import read_table, signal_frames
-from gz_onboard.offline.table import signal_table
+from gz_onboard.recording.tables import read_table, table_of, table_signals
 from gz_onboard.vehicle import read_vehicle
 
 pd = pytest.importorskip("pandas")
@@ -32,15 +30,11 @@ def ride(**columns: Any) -> dict[str, Any]:
 
 
 def currents(data: object) -> list[tuple[float, float]]:
-    """(time from the first [s], current [A]) of each frame that has one."""
-    made, columns = signal_frames(signal_table(data), MAPPING)
-    identifier = made.database.get_message_by_name("pack_current").frame_id
-    frames = columns.tuples()
-    return [
-        ((time - frames[0][0]) * 1e-9, struct.unpack("<d", value)[0])
-        for time, at, value, _ in frames
-        if at & 0x1FFF_FFFF == identifier
-    ]
+    """(time from the first [s], current [A]) of each value."""
+    made, signals = table_signals(table_of(data), MAPPING)
+    those = signals.group == [group.message for group in made.groups].index("pack_current")
+    times = (signals.time_ns - signals.time_ns[0])[those] * 1e-9
+    return list(zip(times.tolist(), signals.value[those].tolist(), strict=True))
 
 
 PLAIN = list(zip(SECONDS.tolist(), AMPERES.tolist(), strict=True))
@@ -168,7 +162,7 @@ def test_so_are_those_of_a_csv_with_few_digits(tmp_path):
     rows = "".join(f"{1.7e9 + second:.8g},14\n" for second in range(3600))
     (tmp_path / "ride.csv").write_text(f"time [s],pack_current [A]\n{rows}")
     with pytest.raises(InputError, match=r"ride\.csv: time \[s\]: .* then none for 100 s: the times are rounded"):
-        signal_frames(read_table(tmp_path / "ride.csv"), MAPPING)
+        table_signals(read_table(tmp_path / "ride.csv"), MAPPING)
 
 
 def test_values_that_share_whole_seconds_or_have_a_row_each_are_a_ride():

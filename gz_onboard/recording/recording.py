@@ -1,7 +1,4 @@
-"""A measured ride: for each role the times and values that came through the codec.
-
-The lab knows no other form of a ride. A log, a simulated ride and any other source become `Samples`.
-"""
+"""One ride as columns, the form in which every offline tool takes it, from a log or from a table of signals."""
 
 from __future__ import annotations
 
@@ -11,17 +8,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from gz_onboard.arguments import check, within
 from gz_onboard.can.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
 from gz_onboard.can.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, hexadecimal
-from gz_onboard.offline.arguments import check, within
-from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.options import MOST_PAYLOAD
 from gz_onboard.recording.decode import decode_columns
-from gz_onboard.recording.frames import BATCH, FrameColumns
+from gz_onboard.recording.frames import BATCH, FrameColumns, SignalColumns
 from gz_onboard.recording.logs import is_table, log_stem, read_log
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.tables import SignalTable, read_table, table_signals
 from gz_onboard.recording.timeline import stray
 from gz_onboard.vehicle import Vehicle
 
@@ -39,7 +36,7 @@ TEXTS = ("kind", "rider", "direction", "note", "vehicle_id")
 
 
 @dataclass(frozen=True)
-class Samples:
+class Recording:
     """One ride as measured.
 
     columns: by role (names and units of `events.ROLES`, and `events.INSTRUMENTS`) the times [s, of one clock for the
@@ -68,47 +65,49 @@ class Samples:
         return rider_mass(self.facts)
 
 
-def read_samples(log: Path | SignalTable, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
-    """The samples in the log of a ride of `vehicle`, with its facts from a ``rides.json`` beside it, if there is one.
+def read_recording(
+    source: Path | SignalTable, vehicle: Vehicle, progress: Callable[[int], None] | None = None
+) -> Recording:
+    """Read the ride of `vehicle` in a log or a table, with what a ``rides.json`` next to the log says about it.
 
-    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
-    vehicle.
+    progress: called with the number of frames. InputError for a log that cannot be read or is not of the vehicle.
     """
-    mapping, frames = open_ride(log, vehicle)
-    file = log.name if isinstance(log, SignalTable) else log
+    mapping, frames = open_ride(source, vehicle)
+    file = source.name if isinstance(source, SignalTable) else source
     columns = read_roles(file, vehicle, Codec(extended(mapping), LONGEST_PAUSE_NS), frames)
     if progress:
         progress(len(frames))
-    return Samples(ride_name(file), columns, {} if isinstance(log, SignalTable) else facts_of(log))
+    return Recording(ride_name(file), columns, {} if isinstance(source, SignalTable) else facts_of(source))
 
 
 def open_ride(
-    log: Path | SignalTable, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
-) -> tuple[BusMapping, FrameColumns]:
-    """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
+    source: Path | SignalTable, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
+) -> tuple[BusMapping, FrameColumns | SignalColumns]:
+    """Return the mapping that decodes the ride in `source`, and its frames, or the values of a table of signals.
 
-    on_damage: as of `read_frames`. Raises InputError for another file, for frames without times, and for a log of a
+    on_damage: see `read_log`. InputError for a file that is neither, for frames without times, and for a log of a
     vehicle without DBC files.
     """
     time = vehicle.mapping.time.name if vehicle.mapping.time else ""
-    if isinstance(log, SignalTable) or is_table(log, time):
-        return signal_frames(log if isinstance(log, SignalTable) else read_table(log), vehicle.mapping)
+    if isinstance(source, SignalTable) or is_table(source, time):
+        return table_signals(source if isinstance(source, SignalTable) else read_table(source), vehicle.mapping)
     if not vehicle.mapping.reads_frames:
         raise vehicle.error(
-            f"dbc is missing: without it a table of signals can be read, but no frames as in {log}; of a "
+            f"dbc is missing: without it a table of signals can be read, but no frames as in {source}; of a "
             "table say which column is the time: [table] time = { column = ..., unit = ... }"
         )
-    frames = read_log(log, on_damage=on_damage)
+    frames = read_log(source, on_damage=on_damage)
     if len(frames) > 1 and not frames.time_ns[:BATCH].any():
-        raise InputError(f"{log}: its frames have no times, which a ride needs; candump -L writes them")
+        raise InputError(f"{source}: its frames have no times, which a ride needs; candump -L writes them")
     return vehicle.mapping, frames
 
 
-def read_roles(log: Path, vehicle: Vehicle, codec: Codec, frames: FrameColumns) -> dict[str, tuple[Array, Array]]:
-    """Decode the frames of `log`: (times [s], values) by role, of all that came more than once.
+def read_roles(
+    log: Path, vehicle: Vehicle, codec: Codec, frames: FrameColumns | SignalColumns
+) -> dict[str, tuple[Array, Array]]:
+    """Decode a ride: (times [s], values) by role, of all that came more than once.
 
-    codec: a new one, which is left as if it had decoded the frames. Raises InputError for a log that is not of the
-    vehicle.
+    codec: a new one, which is left as if it had decoded the frames. InputError for a log that is not of the vehicle.
     """
     columns = decode_columns(frames, codec, stray(frames.time_ns))
     check_ridden(log, vehicle, codec)
@@ -117,7 +116,7 @@ def read_roles(log: Path, vehicle: Vehicle, codec: Codec, frames: FrameColumns) 
 
 def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
     """InputError if none of the frames in a log is the vehicle's, or their times make no ride; codec: has seen all."""
-    if not codec.latest:
+    if not codec.latest and not codec.mapping.groups:
         raise _of_another(log, vehicle, codec)
     for conflict in codec.origins.conflicts.values():
         raise vehicle.error(f"{log}: {conflict}")
