@@ -18,14 +18,13 @@ from gz_onboard.reports.style import (
     ORANGE,
     PURPLE,
     RED,
-    close,
-    headline,
+    Line,
+    Panel,
+    chart,
     legend,
     new_figure,
     ordinate,
     rule,
-    second,
-    stack,
     time_unit,
 )
 
@@ -93,93 +92,55 @@ def overview(
 
     temperatures: measured ones by role [degC], times since the first frame.
     """
-    columns = EstimateColumns(rows)
-    reasons = [str(reason.name) for reason in Reason if columns.where("reasons", str(reason.name)).any()]
-    panels = [(2.0, _range), (1.3, _soc), (1.3, _electric), (1.0, _innovation), (1.3, _motion), (1.3, _consumption)]
-    heights = [height for height, _ in panels] + [1.0, 0.34 + 0.17 * len(reasons)]
-    top = 0.95 if title else 0.35
-    height = top + 1.15 + 1.12 * sum(heights)
-    figure = new_figure(12, height)
-    axes = stack(figure, heights, left=0.125, hspace=0.26, top=top, bottom=0.5)
-    unit, name = time_unit(columns.time[-1] - columns.time[0])
-    x = (columns.time - columns.time[0]) / unit
-    for axis, (_, panel) in zip(axes, panels, strict=False):
-        panel(axis, x, columns)
-    _temperatures(axes[-2], x, columns, temperatures or {}, unit)
-    _states(axes[-1], x, columns, reasons)
-    close(axes, x, f"time [{name}]")
-    if title:
-        headline(figure, 0.125, 1 - 0.32 / height, title, 14)
-        figure.text(0.125, 1 - 0.60 / height, about, fontsize=9.5, color=MUTED, va="center")
+    c = EstimateColumns(rows)
+    unit, x_name = time_unit(c.time[-1] - c.time[0])
+    x = (c.time - c.time[0]) / unit
+    reasons = [str(reason.name) for reason in Reason if c.where("reasons", str(reason.name)).any()]
+    p90 = c("range_p90", 1e-3)
+    farthest = np.max(p90, initial=0.0, where=np.isfinite(p90)) or 1.0
+    distance = [_range(c), Line(usual_gauge(c) * 1e-3, MUTED, "by the last 25 km's Wh/km alone", 0.9, "--")]
+    pack = [
+        Line(c("pack_voltage"), PURPLE, "pack voltage", 1.0),
+        Line(c("pack_current"), ORANGE, "pack current", 0.7, right=True),
+    ]
+    rms = c("innovation_rms", 1000)
+    innovation = Line(c("innovation", 1000), PURPLE, "innovation", 0.8, band=(-rms, rms), band_label="± RMS of 10 s")
+    motion = [
+        Line(c("speed", 3.6), BLUE, "speed"),
+        Line(c("lean", degrees(1.0)), ORANGE, "lean", 0.6, right=True),
+        Line(c("grade", 100), GREEN, "grade", 1.0, right=True),
+    ]
+    consumption = [
+        _with_sd(c, "consumption_expected", 1 / WH_PER_KM, BLUE, "expected"),
+        Line(c("consumption_recent", 1 / WH_PER_KM), ORANGE, "recent (last km)", 1.0),
+    ]
+    warmth = [Line(c("cell_temperature"), ORANGE, "cells", 1.2)]
+    for role, (times, values) in (temperatures or {}).items():
+        at, name = (np.asarray(times) - c.time[0]) / unit, words(role).split()[0]
+        warmth.append(Line(np.asarray(values), TEMPERATURE_COLOURS[role], name, 1.0, x=at))
+    panels = [
+        Panel("range [km]", distance, 2.0, BLUE, limits=(0.0, farthest * 1.12)),  # whatever the gauge shows
+        Panel("SOC [%]", [_with_sd(c, "soc", 100, GREEN, "state of charge")], 1.3, GREEN),
+        Panel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
+        Panel("innovation\n[mV of a cell]", [innovation], 1.0, PURPLE, zero=True),
+        Panel("speed [km/h]", motion, 1.3, BLUE, "grade [%], lean [°]", zero=True),
+        Panel("consumption\n[Wh/km]", consumption, 1.3),
+        Panel("temperature\n[°C]", warmth),
+        Panel("", height=0.34 + 0.17 * len(reasons)),
+    ]
+    figure = chart([[panel] for panel in panels], x, x_name, title, about, left=0.125)
+    _states(figure.axes[len(panels) - 1], x, c, reasons)
     return figure
 
 
-def _range(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    p90 = columns("range_p90", 1e-3)
-    axis.fill_between(x, columns("range_p10", 1e-3), p90, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
-    gauge = usual_gauge(columns) * 1e-3
-    axis.plot(x, gauge, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)), label="by the last 25 km's Wh/km alone")
-    axis.plot(x, columns("range", 1e-3), color=BLUE, linewidth=1.8, label="range")
-    top = np.max(p90, initial=0.0, where=np.isfinite(p90)) or 1.0
-    axis.set_ylim(0, top * 1.12)  # the gauge may show anything: it does not set the scale
-    ordinate(axis, "range [km]", BLUE)
-    legend(axis)
+def _range(c: EstimateColumns) -> Line:
+    edges = c("range_p10", 1e-3), c("range_p90", 1e-3)
+    return Line(c("range", 1e-3), BLUE, "range", 1.8, band=edges, band_label="P10 to P90")
 
 
-def _with_band(axis: Axes, x: Array, middle: Array, sd: Array, colour: str, label: str) -> None:
-    axis.fill_between(x, middle - sd, middle + sd, color=colour, alpha=0.2, linewidth=0, label="± σ")
-    axis.plot(x, middle, color=colour, linewidth=1.6, label=label)
-
-
-def _soc(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    _with_band(axis, x, columns("soc", 100), columns("soc_sd", 100), GREEN, "state of charge")
-    ordinate(axis, "SOC [%]", GREEN)
-    legend(axis)
-
-
-def _electric(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    other = second(axis, "current [A]", ORANGE)
-    other.plot(x, columns("pack_current"), color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
-    axis.plot(x, columns("pack_voltage"), color=PURPLE, linewidth=1.0, label="pack voltage")
-    ordinate(axis, "voltage [V]", PURPLE)
-    legend(axis, other)
-
-
-def _innovation(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    rms = columns("innovation_rms", 1000)
-    axis.fill_between(x, -rms, rms, color=PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
-    axis.plot(x, columns("innovation", 1000), color=PURPLE, linewidth=0.8, label="innovation")
-    axis.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
-    ordinate(axis, "innovation\n[mV of a cell]", PURPLE)
-    legend(axis)
-
-
-def _motion(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    other = second(axis, "grade [%], lean [°]", MUTED)
-    other.plot(x, columns("lean", degrees(1.0)), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
-    other.plot(x, columns("grade", 100), color=GREEN, linewidth=1.0, label="grade")
-    other.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
-    axis.plot(x, columns("speed", 3.6), color=BLUE, linewidth=1.1, label="speed")
-    ordinate(axis, "speed [km/h]", BLUE)
-    legend(axis, other)
-
-
-def _consumption(axis: Axes, x: Array, columns: EstimateColumns) -> None:
-    expected, sd = (columns(f"consumption_expected{part}", 1 / WH_PER_KM) for part in ("", "_sd"))
-    _with_band(axis, x, expected, sd, BLUE, "expected")
-    recent = columns("consumption_recent", 1 / WH_PER_KM)
-    axis.plot(x, recent, color=ORANGE, linewidth=1.0, label="recent (last km)")
-    ordinate(axis, "consumption\n[Wh/km]")
-    legend(axis)
-
-
-def _temperatures(axis: Axes, x: Array, columns: EstimateColumns, measured: Mapping[str, Series], unit: float) -> None:
-    axis.plot(x, columns("cell_temperature"), color=ORANGE, linewidth=1.2, label="cells")
-    for role, (times, values) in measured.items():
-        at = (np.asarray(times) - columns.time[0]) / unit
-        axis.plot(at, values, color=TEMPERATURE_COLOURS[role], linewidth=1.0, label=words(role).split()[0])
-    ordinate(axis, "temperature\n[°C]")
-    legend(axis)
+def _with_sd(c: EstimateColumns, name: str, factor: float, colour: str, label: str) -> Line:
+    middle, sd = c(name, factor), c(f"{name}_sd", factor)
+    return Line(middle, colour, label, 1.6, band=(middle - sd, middle + sd))
 
 
 def _states(axis: Axes, x: Array, columns: EstimateColumns, reasons: Sequence[str]) -> None:
@@ -204,22 +165,14 @@ def _states(axis: Axes, x: Array, columns: EstimateColumns, reasons: Sequence[st
 
 def range_over_distance(rows: Sequence[Row]) -> Figure:
     """Draw the range over the distance, and against it the distance ridden until the last range, plus that range."""
-    columns = EstimateColumns(rows)
-    ridden, left = columns.distance * 1e-3, columns("range", 1e-3)
-    figure = new_figure(12, 3.4)
-    (axis,) = stack(figure, [1.0], left=0.06, hspace=0.0, top=0.35, bottom=0.5)
-    low, high = columns("range_p10", 1e-3), columns("range_p90", 1e-3)
-    axis.fill_between(ridden, low, high, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
-    axis.plot(ridden, left, color=BLUE, linewidth=1.8, label="forecast")
-    known = np.flatnonzero(np.isfinite(left))
-    charged = columns.where("activity", Activity.CHARGING.name).any()
-    if len(known) and ridden[known[-1]] > ridden[known[0]] and not charged:
-        end = ridden[known[-1]]
-        axis.plot([0.0, end], [left[known[-1]] + end, left[known[-1]]], "--", color=MUTED, label="what it came to")
-    axis.set_ylim(bottom=0)
-    ordinate(axis, "range [km]", BLUE)
-    legend(axis)
-    close([axis], ridden, "distance [km]")
+    c = EstimateColumns(rows)
+    ridden, forecast = c.distance * 1e-3, _range(c)
+    lines, known = [forecast], np.flatnonzero(np.isfinite(forecast.y))
+    if len(known) and not c.where("activity", Activity.CHARGING.name).any():
+        end = np.array([0.0, ridden[known[-1]]])
+        lines.append(Line(forecast.y[known[-1]] + end[::-1], MUTED, "what it came to", style="--", x=end))
+    figure = chart([[Panel("range [km]", lines, 2.2, BLUE)]], ridden, "distance [km]", left=0.06)
+    figure.axes[0].set_ylim(bottom=0)
     return figure
 
 

@@ -18,13 +18,11 @@ from gz_onboard.reports.style import (
     ORANGE,
     PURPLE,
     RED,
-    close,
+    Line,
+    Panel,
+    chart,
     headline,
-    legend,
     new_figure,
-    ordinate,
-    second,
-    stack,
     time_unit,
 )
 from gz_onboard.simulation.run import Run
@@ -47,65 +45,74 @@ _LEAST_SHARE = 5e-5  # of all energy: less cannot be seen
 
 
 def overview(run: Run, title: str) -> Figure:
-    """The time series of a ride: speed, throttle and brake, pack, state of charge, temperatures, energy."""
+    """Draw speed, throttle and brake, pack, state of charge, temperatures and energy of a ride over time."""
     s = run.series
-    figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
-    x, time = _time(run)
-    if not np.isnan(s["wanted_speed"]).all():
-        axes[0].plot(x, s["wanted_speed"] * 3.6, color=ORANGE, linewidth=1.0, label="wanted")
-    axes[0].plot(x, s["speed"] * 3.6, color=BLUE, linewidth=1.2, label="ridden")
-    unit, _ = time_unit(run.duration)
-    for i, short in enumerate(run.shortfalls):
-        begin, length = short.time / unit, short.duration / unit
-        label = "shortfall" if not i else None
-        axes[0].axvspan(begin, begin + length, color=RED, alpha=0.15, linewidth=0, label=label)
-    ordinate(axes[0], "speed [km/h]")
-    axes[1].plot(x, s["throttle"] * 100, color=GREEN, linewidth=0.8, label="throttle")
-    axes[1].plot(x, s["brake"] * -100, color=RED, linewidth=0.8, label="brake (down)")
-    ordinate(axes[1], "rider [%]")
-    other = second(axes[2], "current [A]", ORANGE)
-    other.plot(x, s["pack_current"], color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
-    axes[2].plot(x, s["pack_voltage"], color=PURPLE, linewidth=0.9, label="pack voltage")
-    ordinate(axes[2], "voltage [V]", PURPLE)
-    axes[3].plot(x, s["soc"] * 100, color=GREEN, linewidth=1.4, label="state of charge")
-    ordinate(axes[3], "SOC [%]")
-    for name, colour in (("motor", RED), ("inverter", ORANGE), ("cell", PURPLE), ("bms", MUTED)):
-        axes[4].plot(x, s[f"{name}_temperature"], color=colour, linewidth=1.1, label="BMS" if name == "bms" else name)
-    ordinate(axes[4], "temperature [°C]")
-    others = {2: other}
-    if np.any(s["grade"]):
-        others[5] = second(axes[5], "grade [%]", MUTED)
-        others[5].plot(x, s["grade"] * 100, color=MUTED, linewidth=0.8, label="grade")
-    axes[5].plot(x, s["energy"] / WH, color=BLUE, linewidth=1.4, label="energy from the pack")
-    ordinate(axes[5], "energy [Wh]", BLUE)
-    _finish(axes, x, time, others)
-    return figure
+    wanted, short = s["wanted_speed"] * 3.6, np.zeros(len(s["time"]), dtype=bool)
+    for stretch in run.shortfalls:
+        short |= (s["time"] >= stretch.time) & (s["time"] <= stretch.time + stretch.duration)
+    speed = [Line(s["speed"] * 3.6, BLUE, "ridden", 1.2)]
+    if np.isfinite(wanted).any():
+        speed.insert(0, Line(wanted, ORANGE, "wanted", 1.0))
+    if short.any():
+        speed.insert(0, Line(np.where(short, wanted, np.nan), RED, "shortfall", 3.0))
+    rider = [Line(s["throttle"] * 100, GREEN, "throttle", 0.8), Line(s["brake"] * -100, RED, "brake (down)", 0.8)]
+    pack = [
+        Line(s["pack_voltage"], PURPLE, "pack voltage", 0.9),
+        Line(s["pack_current"], ORANGE, "pack current", 0.7, right=True),
+    ]
+    warmth = [
+        Line(s[f"{name.lower()}_temperature"], colour, name)
+        for name, colour in (("motor", RED), ("inverter", ORANGE), ("cell", PURPLE), ("BMS", MUTED))
+    ]
+    energy, hilly = [Line(s["energy"] / WH, BLUE, "energy from the pack", 1.4)], bool(np.any(s["grade"]))
+    if hilly:
+        energy.append(Line(s["grade"] * 100, MUTED, "grade", 0.8, right=True))
+    panels = [
+        Panel("speed [km/h]", speed, 1.7),
+        Panel("rider [%]", rider),
+        Panel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
+        Panel("SOC [%]", [Line(s["soc"] * 100, GREEN, "state of charge", 1.4)]),
+        Panel("temperature [°C]", warmth),
+        Panel("energy [Wh]", energy, 1.2, BLUE, "grade [%]" if hilly else None),
+    ]
+    return _over_time(run, panels, title)
+
+
+COMPARED = {
+    "speed": ("speed [km/h]", 3.6),
+    "soc": ("SOC [%]", 100.0),
+    "pack_voltage": ("pack voltage [V]", 1.0),
+    "pack_current": ("pack current [A]", 1.0),
+    "motor_torque": ("motor torque [N·m]", 1.0),
+    "throttle": ("throttle [%]", 100.0),
+    "motor_temperature": ("motor [°C]", 1.0),
+}
+"""Columns of measurement and simulation that are compared: text and factor from SI units."""
 
 
 def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
-    """Compare measurement and simulation: speed, SOC, pack voltage, pack current, motor torque, throttle, temperatures.
+    """Draw the columns `COMPARED` measured and simulated.
 
     measured: by the names of `run.COLUMNS`, of the length of the run's series; missing columns are not drawn.
     """
-    s = run.series
-    rows = [
-        ("speed", "speed [km/h]", 3.6),
-        ("soc", "SOC [%]", 100.0),
-        ("pack_voltage", "pack voltage [V]", 1.0),
-        ("pack_current", "pack current [A]", 1.0),
-        ("motor_torque", "motor torque [N·m]", 1.0),
-        ("throttle", "throttle [%]", 100.0),
-        ("motor_temperature", "motor [°C]", 1.0),
+    panels = [
+        Panel(
+            text,
+            [
+                Line(measured[name] * factor, INK, "measured", 1.0),
+                Line(run.series[name] * factor, ORANGE, "simulated", 0.9),
+            ],
+            1.6 if name == "speed" else 1.0,
+        )
+        for name, (text, factor) in COMPARED.items()
+        if name in measured
     ]
-    rows = [row for row in rows if row[0] in measured]
-    figure, axes = _panels(title, [1.6, *[1.0] * (len(rows) - 1)])
-    x, label = _time(run)
-    for axis, (name, text, factor) in zip(axes, rows, strict=True):
-        axis.plot(x, measured[name] * factor, color=INK, linewidth=1.0, label="measured")
-        axis.plot(x, s[name] * factor, color=ORANGE, linewidth=0.9, alpha=0.85, label="simulated")
-        ordinate(axis, text)
-    _finish(axes, x, label, {})
-    return figure
+    return _over_time(run, panels, title)
+
+
+def _over_time(run: Run, panels: Sequence[Panel], title: str) -> Figure:
+    unit, name = time_unit(run.duration)
+    return chart([[panel] for panel in panels], run.series["time"] / unit, name, title)
 
 
 Flow = tuple[str, float, str]
@@ -182,18 +189,16 @@ def _band(axis: Axes, start: tuple[float, float], end: tuple[float, float], thic
 
 
 def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Variant], title: str) -> Figure:
-    """Range and consumption against one parameter."""
-    figure, axes = _panels(title, (1.3, 1.3))
-    for axis, key, text, colour in zip(
-        axes, ("range_km", "consumption_wh_km"), ("range [km]", "consumption [Wh/km]"), (BLUE, ORANGE), strict=True
-    ):
-        column = [float("nan") if value is None else value for value in (getattr(v, key) for v in variants)]
-        axis.plot(values, column, color=colour, linewidth=1.6, marker="o", markersize=4)
-        ordinate(axis, text, colour)
-    axes[0].tick_params(labelbottom=False)
-    axes[1].set_xlabel(name, color=INK, fontsize=9, loc="left")
-    axes[0].margins(x=0.03)
-    return figure
+    """Draw range and consumption against one parameter."""
+    ranges, consumptions = (
+        np.array([getattr(variant, key) for variant in variants], dtype=float)
+        for key in ("range_km", "consumption_wh_km")
+    )
+    rows = [
+        [Panel("range [km]", [Line(ranges, BLUE, "range", 1.6, "o-")], 1.3, BLUE)],
+        [Panel("consumption [Wh/km]", [Line(consumptions, ORANGE, "consumption", 1.6, "o-")], 1.3, ORANGE)],
+    ]
+    return chart(rows, np.array(values), name, title)
 
 
 def sweep_map(
@@ -219,24 +224,3 @@ def sweep_map(
         axis.tick_params(colors=MUTED, labelsize=8)
     headline(figure, 0.03, 0.94, title)
     return figure
-
-
-# --- panels -------------------------------------------------------------------------------------------------------
-
-
-def _panels(title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
-    height = 1.6 + 1.15 * sum(heights)
-    figure = new_figure(12, height)
-    headline(figure, 0.08, 1 - 0.35 / height, title)
-    return figure, stack(figure, heights, left=0.08, hspace=0.3, top=0.85, bottom=0.55)
-
-
-def _time(run: Run) -> tuple[Any, str]:
-    seconds, unit = time_unit(run.duration)
-    return run.series["time"] / seconds, f"time [{unit}]"
-
-
-def _finish(axes: Sequence[Axes], x: Any, text: str, seconds: Mapping[int, Axes]) -> None:
-    for i, axis in enumerate(axes):
-        legend(axis, *([seconds[i]] if i in seconds else []))
-    close(axes, x, text)
