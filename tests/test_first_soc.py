@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.cooling_run import ride_run
+from gz_onboard.calibration.cooling import ride_run
 from gz_onboard.discovery.mixed_model import initial
 from gz_onboard.discovery.residuals import start_soc
 from gz_onboard.events import Group

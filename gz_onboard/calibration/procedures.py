@@ -9,18 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.calibration import (
-    auxiliary,
-    cell,
-    cooling,
-    cooling_run,
-    losses,
-    motor,
-    offsets,
-    pulse,
-    resistance,
-    wheel,
-)
+from gz_onboard.calibration import auxiliary, cell, cooling, losses, motor, offsets, pulse, resistance, wheel
 from gz_onboard.calibration import coastdown as coasting
 from gz_onboard.calibration.coastdown_run import samples as coastdown_samples
 from gz_onboard.calibration.manifest import Option, Slot
@@ -137,36 +126,19 @@ def _resistance(given: Given) -> Result:
 
 
 def _cooling(given: Given) -> Result:
-    """All four networks, of what of them the data show; what is missing is said."""
-    runs, held = _cooling_runs(given, "data"), _cooling_runs(given, "held_out")
-    result = Result("cooling")
-    networks = {
-        "motor_temperature": cooling.motor_cooling,
-        "inverter_temperature": cooling.inverter_cooling,
-        "cell_temperature": cooling.pack_cooling,
-        "bms_temperature": cooling.bms_cooling,
-    }
-    for sensor, network in networks.items():
-        if any(sensor in run.measured for run in runs):
-            result.add(network(runs, given.vehicle, [run for run in held if sensor in run.measured]))
-        else:
-            result.refusals.append(f"{network.__name__}: no run has {sensor}")
-    if not result.parameters:
-        raise InputError(f"none of the runs has {', '.join(networks)}")
-    return result
+    runs, validation = _cooling_runs(given, "data"), _cooling_runs(given, "held_out")
+    return cooling.calibrate_cooling(runs, given.vehicle, validation)
 
 
-def _cooling_runs(given: Given, slot: str) -> list[cooling_run.CoolingRun]:
+def _cooling_runs(given: Given, slot: str) -> list[cooling.CoolingRun]:
     """Those with no airflow stated: tables from a closed room, rides and rollers with air as fast as the wheel."""
     airflow = given.options["airflow"]
     assert isinstance(airflow, Mapping)
     of_log = {ride_name(Path(name)): value for name, value in airflow.items()}
     return [
-        cooling_run.bench_run(table, given.vehicle, airflow.get(table.file.name, "none"))
+        cooling.bench_run(table, given.vehicle, airflow.get(table.file.name, "none"))
         for table in given.tables.get(slot, [])
-    ] + [
-        cooling_run.ride_run(ride, given.vehicle, of_log.get(ride.name, "wheel")) for ride in given.rides.get(slot, [])
-    ]
+    ] + [cooling.ride_run(ride, given.vehicle, of_log.get(ride.name, "wheel")) for ride in given.rides.get(slot, [])]
 
 
 def _coastdown(given: Given) -> Result:

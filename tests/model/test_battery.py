@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.calibration.cooling_run import dissipation
+from gz_onboard.calibration.cooling import dissipation
 from gz_onboard.model.battery import current_of
 from gz_onboard.model.drawable import DISCHARGE, drawable
 from gz_onboard.model.functions import Mesh

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.calibration.circuit import Circuit, Reaction, voltage
 from gz_onboard.calibration.coastdown_run import Coast
-from gz_onboard.calibration.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures
-from gz_onboard.calibration.cooling_run import CoolingRun
+from gz_onboard.calibration.cooling import ENTROPY, ENTROPY_SOC, CoolingRun, motor_temperatures, pack_temperatures
 from gz_onboard.calibration.road_load import RoadLoad
 from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import Ride
