@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
@@ -184,30 +183,6 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
 Snapshot = dict[str, Any]
 
 
-def foreign(snapshot: Snapshot) -> None:
-    snapshot["key"] = "another scooter|10s4p"
-
-
-def other_version(snapshot: Snapshot) -> None:
-    snapshot["version"] = 99
-
-
-def implausible(snapshot: Snapshot) -> None:
-    snapshot["soc"] = 5.0
-
-
-def incomplete(snapshot: Snapshot) -> None:
-    del snapshot["riding"]
-
-
-def without_numbers(snapshot: Snapshot) -> None:
-    snapshot["soc_variance"] = "a"
-
-
-def without_states(snapshot: Snapshot) -> None:
-    snapshot["riding"]["effects"] = None
-
-
 @pytest.fixture(scope="module")
 def learned() -> Snapshot:
     """What five seconds of riding have taught, with a bias that no fresh estimator has."""
@@ -225,16 +200,15 @@ def is_fresh(daemon: Daemon) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"), [(foreign, "['another scooter', '10s4p'] saved"), (other_version, "is of version 99")]
+    ("odd", "said"),
+    [({"key": "another scooter|10s4p"}, "['another scooter', '10s4p'] saved"), ({"version": 99}, "is of version 99")],
 )
 def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, odd: Snapshot, said: str
 ):
     caplog.set_level(logging.INFO)
     file = tmp_path / "scooter.json"
-    snapshot = copy.deepcopy(learned)
-    spoil(snapshot)
-    state.write(file, state.encode(snapshot, time.time()))
+    state.write(file, state.encode(learned | odd, time.time()))
     text = file.read_bytes()
     daemon = Daemon(reference(), [], None, file)
     daemon.stop()
@@ -246,57 +220,21 @@ def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     assert aside.read_bytes() == text
 
 
-def impossible_covariance(snapshot: Snapshot) -> None:
-    snapshot["learned"]["capacity_with_soc"] = 1.0
-
-
-def odd_weakest(snapshot: Snapshot) -> None:
-    snapshot["learned"]["weakest"] = {"of": "much"}
-
-
-def odd_capacity(snapshot: Snapshot) -> None:
-    snapshot["learned"]["capacity_variance"] = -1.0
-
-
-def without_learned(snapshot: Snapshot) -> None:
-    snapshot["learned"] = [1, 2]
-
-
-def with_a_large_bias(snapshot: Snapshot) -> None:
-    snapshot["gyro_bias"] = [9.0, 0.0]
-
-
-def with_more(snapshot: Snapshot) -> None:
-    snapshot["riding"]["another"] = 1.0
-
-
-def not_a_number(snapshot: Snapshot) -> None:
-    snapshot["v1"] = float("nan")
-
-
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("odd", "said"),
     [
-        (implausible, "state.soc is 5.0, not from 0 to 1"),
-        (without_numbers, "state.soc_variance is 'a'"),
-        (impossible_covariance, "state.learned.capacity_with_soc is impossible"),
-        (incomplete, "state has "),
-        (without_states, "state.riding.effects is None"),
-        (odd_capacity, "state.learned.capacity_variance is -1.0"),
-        (odd_weakest, "state.learned.weakest has ['of'], not of, means, rows, blocks"),
-        (without_learned, "state.learned has [1, 2], not "),
-        (with_a_large_bias, "state.gyro_bias.0 is 9.0"),
-        (with_more, "state.riding has "),
-        (not_a_number, "state.v1 is nan"),
+        ({"soc": 5.0}, "state.soc is 5.0, not from 0 to 1"),
+        ({"soc_variance": "a"}, "state.soc_variance is 'a'"),
+        ({"learned": [1, 2]}, "state.learned has [1, 2], not "),
+        ({"more": 1.0}, "state has "),
+        ({"v1": float("nan")}, "state.v1 is nan"),
     ],
 )
 def test_a_damaged_state_is_refused_whole_and_the_one_before_is_used(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, odd: Snapshot, said: str
 ):
     file = tmp_path / "scooter.json"
-    snapshot = copy.deepcopy(learned)
-    spoil(snapshot)
-    sealed = json.dumps({"saved_at": time.time(), "uptime": None, "estimator": snapshot}).encode()[1:]
+    sealed = json.dumps({"saved_at": time.time(), "uptime": None, "estimator": learned | odd}).encode()[1:]
     state.write(file, b'{"crc32": "%08x", %s\n' % (zlib.crc32(sealed), sealed))
     daemon = Daemon(reference(), [], None, file)
     assert daemon.restore() is None

@@ -285,9 +285,6 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
     assert all(is_complete(path) for path in left)
 
 
-# --- power cuts ------------------------------------------------------------------------------------------------
-
-
 # --- in the background -----------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""A log as the daemon writes it, as others read it: what the doctor says, positions, and the layout for Foxglove."""
+"""A log as the daemon writes it, as others read it: positions, signals, and the layout for Foxglove."""
 
 from __future__ import annotations
 

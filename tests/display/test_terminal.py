@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import select
+import signal
 import struct
 import subprocess
 import sys
@@ -356,19 +357,33 @@ class Terminal:
         os.close(self.slave)
 
 
-def test_no_picture_is_larger_than_the_terminal():
-    small = Terminal(rows=8, columns=40)
-    child = start("--duration", "2", out=small.slave)
-    small.until(r"\x1b\[\?1049l")
+@pytest.fixture
+def tty():
+    opened = Terminal()
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_on_a_terminal_and_left_as_it_was(tty, number):
+    child = start(out=tty.slave)
+    tty.until(r"34\.2 km")
+    tty.until("[1-9] bad")
+    assert tty.text.startswith("\x1b[?1049h\x1b[?25l")  # the other screen, no cursor
+    assert "\x1b[1;33m" in tty.text
+    frames = tty.text.count("\x1b[H")
+    tty.read(1.0)
+    child.send_signal(number)
+    tty.until(r"\x1b\[\?25h\x1b\[\?1049l")
     assert child.wait(10) == 0
-    pictures = small.text.split("\x1b[?1049l")[0].split("\x1b[H")[1:]
-    assert len(pictures) >= 2
-    for text in pictures:
-        lines = re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", text))
-        assert len(lines) <= 8
-        assert max(map(len, lines)) <= 40
+    for _ in range(5):
+        tty.read(0.1)
+    assert frames >= 1
+    rest = tty.text.split("\x1b[?1049l")[1]
+    assert "34.2 km" in rest  # the last picture stays
+    assert termios.tcgetattr(tty.slave) == tty.before
+    assert child.stderr.read() == b""
     child.stderr.close()
-    small.close()
 
 
 def test_lines_where_there_is_no_terminal(tmp_path):

@@ -206,9 +206,6 @@ def test_cells_of_another_resistance_do_not_make_it_leave_a_right_estimate(resis
     assert max(abs(row.soc - true) for true, row in rows) < 0.1
 
 
-# --- the pack's messages are lost -----------------------------------------------------------------------------------
-
-
 # --- restarts -------------------------------------------------------------------------------------------------------
 
 AWAY = [

@@ -186,6 +186,3 @@ def test_what_was_learned_outlives_a_restart(rough):
     assert second.forecaster.forecast(*at) == mended.forecast(*at)
     with pytest.raises(ValueError, match="rough_road"):
         estimated(BASE, []).restore(saved, BASE.key, 5.0)
-
-
-# --- from frames --------------------------------------------------------------------------------------------------
