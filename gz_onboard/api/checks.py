@@ -17,8 +17,7 @@ from gz_onboard.reports.results import descriptions
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.check import Checked, RoleSeen, check_log, check_text
 from gz_onboard.vehicle_check.command import roles_text
-from gz_onboard.vehicle_check.features import Feature, features_of
-from gz_onboard.vehicle_check.finding import Finding, Looks
+from gz_onboard.vehicle_check.finding import Feature, Finding, Looks, features_of
 
 
 @dataclass(frozen=True)

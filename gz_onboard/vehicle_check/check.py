@@ -1,11 +1,10 @@
-"""A log against a vehicle file: what fills each role, what looks right and what wrong, what is missing for what."""
+"""A log against a vehicle file: the signal of each role, likely mistakes, and missing roles."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot, sqrt
 from pathlib import Path
 from typing import Annotated
 
@@ -14,32 +13,46 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.can.codec import LONGEST_PAUSE_NS, RANGE, Codec
 from gz_onboard.can.layout import identifier_of
-from gz_onboard.can.mapping import UNITS, BusMapping, Source
+from gz_onboard.can.mapping import UNITS, Source
 from gz_onboard.can.requests import NEGATIVE
-from gz_onboard.estimation.ride import PAUSE_S
+from gz_onboard.errors import InputError
+from gz_onboard.estimation.ride import PAUSE_S, RideOptions, open_estimate, run_ride
+from gz_onboard.estimation.summary import POOR_FIT_V, summary_of
 from gz_onboard.estimator.signals import TIMING
-from gz_onboard.events import STALE_PERIODS, Group, hexadecimal, words
+from gz_onboard.events import STALE_PERIODS, hexadecimal, words
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.recording import Recording, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.reports.results import clock, leap_text
 from gz_onboard.vehicle import Vehicle
-from gz_onboard.vehicle_check import charge, electric, motion, others
-from gz_onboard.vehicle_check.features import NEEDS, Feature, features_of, features_text
-from gz_onboard.vehicle_check.finding import Finding, Looks, unknown, wrong
-from gz_onboard.vehicle_check.on_board import on_board
-from gz_onboard.vehicle_check.rolling import MOTOR, rolling_of
+from gz_onboard.vehicle_check.finding import (
+    NEEDS,
+    Feature,
+    Finding,
+    Looks,
+    features_of,
+    features_text,
+    right,
+    unknown,
+    wrong,
+)
+from gz_onboard.vehicle_check.motion import check_accelerations, check_speeds, check_turning
+from gz_onboard.vehicle_check.others import check_others
+from gz_onboard.vehicle_check.pack import POWER, PackRide, check_pack, drawn
 from gz_onboard.vehicle_check.seconds import FEWEST, Seconds, seconds_of
 
 CHECK_VERSION = 1
-RARE = 0.9  # of the time: a signal that is there for less is told
+RARE = 0.9  # of the time: a signal that is there for less is reported
 MOST_DIGITS = 2  # hexadecimal, in which an identifier may differ from the one that was meant
-DROPPED = 0.01  # of the values: as many out of the limits are wrong limits, or a wrong layout
-_LATER = unknown("on board", (), "not tried: what looks wrong would mislead it")
+DROPPED = 0.01  # of the values: as many outside the limits are wrong limits, or a wrong layout
+LEFT_OUT = 0.2  # of the time: a sensor that the daemon leaves out for as long has no passing fault
+INNOVATION_V = 0.03  # of a cell: less is a good table of a battery
+BY_LOAD = {"accel_x", "gps_altitude"}  # the daemon holds them against the grade by the power that is needed
+Columns = Mapping[str, tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
 class RoleSeen:
-    """What a log has of a role."""
+    """The signal of a role in a log."""
 
     role: Annotated[str, "its name"]
     signal: Annotated[str, "its signal in the DBC file"]
@@ -53,7 +66,7 @@ class RoleSeen:
 
 @dataclass(frozen=True)
 class Checked:
-    """A log."""
+    """A log that was checked."""
 
     file: Annotated[str, "the log"]
     duration_s: Annotated[float, "from the first to the last value, without pauses"]
@@ -62,40 +75,52 @@ class Checked:
     features: Annotated[list[Feature], "and what is missing for each"]
 
     def those(self, looks: Looks) -> list[Finding]:
-        """The findings with this verdict."""
+        """Return the findings with this verdict."""
         return [finding for finding in self.findings if finding.looks is looks]
 
 
 def check_log(
     log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None, quick: bool = False
 ) -> Checked:
-    """Check one log; quick: without `on_board`. Raises InputError for one that cannot be read."""
+    """Check one log; quick: without the daemon's pipeline. Raises InputError for a log that cannot be read."""
     mapping, frames = open_ride(log, vehicle)
     codec = Codec(mapping, LONGEST_PAUSE_NS)
     columns = read_roles(log, vehicle, codec, frames)
     if progress:
         progress(len(frames))
-    lengths = _last_lengths(frames) if isinstance(frames, FrameColumns) else {}
-    samples = Recording(ride_name(log), columns, facts_of(log))
+    samples, (duration, end) = Recording(ride_name(log), columns, facts_of(log)), _passed(columns)
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
-    findings += _never_came(codec, columns, lengths, _passed(columns)[0])
-    findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
-    ride = seconds_of(samples, vehicle) if columns else None
-    if ride:
+    lengths = {} if not isinstance(frames, FrameColumns) else _lengths(frames)
+    findings += [*_never_came(codec, columns, lengths, duration), *_dropped(codec, columns)]
+    findings += _unanswered(codec, columns)
+    if columns:
+        ride = seconds_of(samples, vehicle)
         if len(ride.time) < FEWEST:
-            findings.append(unknown("length", (), f"{_passed(columns)[0]:.1f} s: most checks need {FEWEST} s and more"))
-        checks = checks_of(ride, vehicle, samples.rider_mass)
-        findings += electric.unless_contradicted(checks)
-    if ride and not quick:
-        suspected = any(finding.looks is Looks.WRONG for finding in findings)
-        load = all(one.looks is Looks.RIGHT for one in findings if one.check == electric.BY_POWER)
-        findings += [_LATER] if suspected else on_board(log, vehicle, load, electric.drawn(ride, vehicle))
-    duration, end = _passed(columns)
-    seen = _roles(mapping, codec.groups, samples, (duration, end), findings)
+            findings.append(unknown("length", (), f"{duration:.1f} s: most checks need {FEWEST} s and more"))
+        findings += check_ride(ride, vehicle, samples.rider_mass)
+        if not quick and any(one.looks is Looks.WRONG for one in findings):
+            findings.append(unknown("on board", (), "not tried: what looks wrong would mislead it"))
+        elif not quick:
+            load_fits = all(one.looks is Looks.RIGHT for one in findings if one.check == POWER.check)
+            findings += on_board(log, vehicle, load_fits, drawn(ride, vehicle))
+    seen = [_seen(source, codec, columns, (duration, end), findings) for source in mapping.sources]
     return Checked(str(log), duration, seen, findings, features_of(columns))
 
 
-def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
+def check_ride(ride: Seconds, vehicle: Vehicle, payload: float | None) -> list[Finding]:
+    """Return the findings of a ride about itself and the vehicle file; payload [kg], if known."""
+    speeds = check_speeds(ride, vehicle)
+    speed = speeds.speeds[speeds.best] if speeds.best else None
+    findings = [*speeds.findings, *check_accelerations(ride, speeds), *check_turning(ride, speeds)]
+    doubted = {role for one in speeds.findings if one.looks is Looks.WRONG for role in one.roles}
+    of_pack, of = check_pack(ride, vehicle, speed if speeds.sure else None, payload, doubted)
+    return [*findings, *of_pack, *check_others(ride, speed, of.current if of else None, speeds.bench)]
+
+
+# --- frames and signals -----------------------------------------------------------------------------------------------
+
+
+def _passed(columns: Columns) -> tuple[float, float]:
     """(time [s] that passed while values came, without pauses; when the last one came)."""
     if not columns:
         return 0.0, 0.0
@@ -105,30 +130,31 @@ def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
     return end - start - float(steps[steps > PAUSE_S].sum()), end
 
 
-def _last_lengths(frames: FrameColumns) -> dict[int, int]:
+def _lengths(frames: FrameColumns) -> dict[int, int]:
     """Bytes of the last frame of each identifier."""
-    backwards = frames[::-1]
-    identifiers, last = np.unique(backwards.identifier, return_index=True)
-    return dict(zip(identifiers.tolist(), backwards.length[last].tolist(), strict=True))
+    return dict(zip(frames.identifier.tolist(), frames.length.tolist(), strict=True))
 
 
 def _never_came(
     codec: Codec, columns: Collection[str], lengths: Mapping[int, int], duration: float
 ) -> Iterator[Finding]:
-    """Roles of the file that the range needs, and of which a log of that `duration` [s] has no value."""
+    """Roles of the file that the range needs, and of which a log of that `duration` [s] has no value.
+
+    lengths: bytes by identifier.
+    """
     needed, wanted = NEEDS["range"]
     for group in (*needed, *wanted):
         silent = [source for source in codec.mapping.sources if source.role in group]
-        late = min((_stale(codec.mapping.periods.get(source.message)) for source in silent), default=0.0)
+        late = min((_stale(codec, source) for source in silent), default=0.0)
         if silent and not set(group) & set(columns) and duration > late:
-            roles = tuple(source.role for source in silent)
             without = "no range" if group in needed else "no energy"
-            text = f"{words(roles[0])} never came: {without}{_likely_identifier(codec, silent[0], lengths)}"
-            yield wrong("never came", roles, text)
+            text = f"{words(silent[0].role)} never came: {without}{_likely_identifier(codec, silent[0], lengths)}"
+            yield wrong("never came", tuple(source.role for source in silent), text)
 
 
-def _stale(period: float | None) -> float:
-    """When a signal of this `period` [s] is stale [s]."""
+def _stale(codec: Codec, source: Source) -> float:
+    """When the signal of `source` is stale [s]."""
+    period = codec.mapping.periods.get(source.message)
     return STALE_PERIODS * period if period else TIMING.unknown_stale
 
 
@@ -140,19 +166,21 @@ def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int])
     for channel, identifier in codec.heard(message.name):
         return f"; {message.name} came on channel {channel} as {hexadecimal(identifier)}: see [bus] of the vehicle file"
     wanted = hexadecimal(identifier_of(message))
-    digits = {one: sum(a != b for a, b in zip(hexadecimal(one), wanted, strict=False)) for one in codec.unknown}
-    found = [one for one in digits if lengths.get(one) == message.length and len(hexadecimal(one)) == len(wanted)]
-    best = min(found, key=lambda one: digits[one], default=None)
+    text = f"; {source.message} is {wanted} in the DBC file"
+    digits = {
+        one: sum(a != b for a, b in zip(hexadecimal(one), wanted, strict=True))
+        for one in codec.unknown
+        if lengths.get(one) == message.length and len(hexadecimal(one)) == len(wanted)
+    }
+    best = min(digits, key=lambda one: digits[one], default=None)
     if best is None or digits[best] > MOST_DIGITS:
-        return f"; {source.message} is {wanted} in the DBC file"
-    return (
-        f"; {source.message} is {wanted} in the DBC file, and {hexadecimal(best)}, which no file knows, has "
-        f"{message.length} bytes too and came {codec.unknown[best]} times"
-    )
+        return text
+    came = f"has {message.length} bytes too and came {codec.unknown[best]} times"
+    return f"{text}, and {hexadecimal(best)}, which no file knows, {came}"
 
 
-def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
-    """Signals whose values were dropped, out of the limits of the DBC file or of any vehicle."""
+def _dropped(codec: Codec, columns: Columns) -> Iterator[Finding]:
+    """Signals whose values were dropped, outside the limits of the DBC file or of any vehicle."""
     roles = {f"{source.message}.{source.signal}": source.role for source in codec.mapping.sources}
     for (name, reason), count in sorted(codec.faults.items()):
         role = roles.get(name)
@@ -162,119 +190,98 @@ def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterat
             yield wrong("limits", (role,), text)
 
 
-def _unanswered(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
+def _unanswered(codec: Codec, columns: Columns) -> Iterator[Finding]:
     """Requests whose answers have another length than the file says, and those that an ECU refused."""
-    roles: dict[str, tuple[str, ...]] = {}
-    for source in codec.mapping.sources:
-        roles[source.message] = (*roles.get(source.message, ()), source.role)
+    roles = {
+        request.name: tuple(source.role for source in codec.mapping.sources if source.message == request.name)
+        for request in codec.mapping.requests
+    }
     for request in codec.mapping.requests:
-        named = roles.get(request.name, ())
-        if request.name in codec.wrong_lengths:
-            text = (
-                f"{request.name} has {codec.wrong_lengths[request.name]} bytes, the file says {request.message.length}"
-            )
-            yield wrong("length of the answer", named, text)
+        if length := codec.wrong_lengths.get(request.name):
+            text = f"{request.name} has {length} bytes, the file says {request.message.length}"
+            yield wrong("length of the answer", roles[request.name], text)
     for (place, reason), count in sorted(codec.faults.items()):
         if reason.startswith(NEGATIVE):
-            silent = tuple(
-                role for of in codec.mapping.requests for role in roles.get(of.name, ()) if role not in columns
-            )
+            silent = tuple(role for named in roles.values() for role in named if role not in columns)
             yield unknown("requests", silent, f"{count} times {reason} on {place}")
 
 
-def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
-    """All that a ride says of itself and the vehicle file; payload [kg], if known."""
-    rolling = rolling_of(ride, motion.speeds_of(ride, vehicle), vehicle)
-    speeds = rolling.speeds
-    by_speed = list(motion.check_speeds(ride, speeds))
-    doubted = frozenset(role for finding in by_speed if finding.looks is Looks.WRONG for role in finding.roles)
-    turned = frozenset(role for finding in by_speed if finding.check == motion.SIGN for role in finding.roles)
-    sized = frozenset(one for f in by_speed if f.looks is Looks.WRONG and f.check != motion.SIGN for one in f.roles)
-    # what only follows from a sign that is already named is no other's mistake
-    right_way = replace(ride, columns={**ride.columns, **{role: -ride[role] for role in turned}})
-    forward = {role: -speed if role in turned else speed for role, speed in speeds.items()}
-    best = next((role for role in forward if role not in doubted), next(iter(forward), None))
-    speed = forward[best] if best else None
-    motor_off = MOTOR in sized.union(*(finding.roles for finding in rolling.findings))
-    of = electric.drawn(ride, vehicle)
-    return chain(
-        rolling.findings,
-        rolling.by_what_fits(by_speed),
-        rolling.by_what_fits(motion.check_distances(ride, speeds, doubted, vehicle.parameters["wheel_radius"])),
-        motion.check_accelerations(ride, speeds, doubted),
-        motion.check_turning(ride, speeds),
-        electric.check_voltages(ride, vehicle.battery, of.current if of else None) if vehicle.battery else (),
-        electric.check_sag(of) if of else (),
-        _unless_at_a_wrong_speed(
-            best in sized, electric.check_road(ride, of, speed, electric.model_power(ride, vehicle, speed, payload))
-        )
-        if of and speed is not None
-        else (),
-        electric.check_currents(ride),
-        _unless_at_a_wrong_speed(motor_off, electric.check_motor(right_way, of)),
-        charge.check_charge(ride, of, vehicle),
-        others.check_temperatures(ride, speed),
-        others.check_switches(ride, speed),
-        others.check_throttle(ride, of.current if of else None),
-        others.check_stuck(ride, speed, any(motion.BENCH in finding.text for finding in by_speed)),
-    )
-
-
-def _unless_at_a_wrong_speed(off: bool, findings: Iterable[Finding]) -> list[Finding]:
-    """What follows from the size of a speed accuses nobody if that is `off`; a sign does not follow from it."""
-    text = "; the speed that it is by is wrong"
-    return [
-        unknown(one.check, one.roles, one.text + text)
-        if off and one.looks is Looks.WRONG and "sign" not in one.text
-        else one
-        for one in findings
-    ]
-
-
-def _roles(
-    mapping: BusMapping,
-    groups: Sequence[Group],
-    samples: Recording,
-    span: tuple[float, float],
-    findings: Sequence[Finding],
-) -> list[RoleSeen]:
+def _seen(
+    source: Source, codec: Codec, columns: Columns, span: tuple[float, float], findings: Sequence[Finding]
+) -> RoleSeen:
     """span: as of `_passed`."""
-    periods = {group.message: group.period for group in groups}
-    found = []
-    for source in mapping.sources:
-        said = {finding.looks for finding in findings if source.role in finding.roles}
-        looks = next((verdict for verdict in (Looks.WRONG, Looks.RIGHT) if verdict in said), Looks.UNKNOWN)
-        rate = low = high = None
-        share = 0.0
-        if source.role in samples.columns:
-            times, values = samples.columns[source.role]
-            stale = _stale(periods.get(source.message))
-            rate = 1 / max(float(np.median(np.diff(times))), 1e-6) if len(times) > 1 else None
-            low, high = float(values.min()), float(values.max())
-            held = float(np.minimum(np.diff(times, append=span[1]), stale).sum())
-            share = min(held / max(span[0], 1e-9), 1.0)
-        found.append(RoleSeen(source.role, source.signal, looks, UNITS[source.role], rate, low, high, share))
-    return found
+    verdicts = {finding.looks for finding in findings if source.role in finding.roles}
+    looks = next((one for one in (Looks.WRONG, Looks.RIGHT) if one in verdicts), Looks.UNKNOWN)
+    if source.role not in columns:
+        return RoleSeen(source.role, source.signal, looks, UNITS[source.role], None, None, None, 0.0)
+    times, values = columns[source.role]
+    rate = 1 / max(float(np.median(np.diff(times))), 1e-6) if len(times) > 1 else None
+    held = float(np.minimum(np.diff(times, append=span[1]), _stale(codec, source)).sum())
+    share = min(held / max(span[0], 1e-9), 1.0)
+    limits = float(values.min()), float(values.max())
+    return RoleSeen(source.role, source.signal, looks, UNITS[source.role], rate, *limits, share)
+
+
+# --- the daemon's own checks ------------------------------------------------------------------------------------------
+
+
+def on_board(log: Path, vehicle: Vehicle, load_fits: bool, of: PackRide | None) -> Iterator[Finding]:
+    """Run the daemon's pipeline over the log: sensors that it leaves out, and the error of the voltage.
+
+    load_fits: whether the power needed is the model's. of: what the pack gives.
+    """
+    if vehicle.battery is None:
+        return
+    try:
+        summary = summary_of(run_ride(open_estimate(log, vehicle), RideOptions()))
+    except InputError as error:  # no battery, range frames that do not fit: `run` reports it
+        yield unknown("on board", (), str(error))
+        return
+    for role, seconds in summary.distrusted.items():
+        if seconds > LEFT_OUT * summary.duration_s:
+            text = f"the daemon would leave {role} out for {clock(seconds)}: it contradicts the others"
+            of_file = role in BY_LOAD and not load_fits
+            hint = ", or the file's mass, drag area or losses are wrong" if of_file else ""
+            yield wrong("on board", () if of_file else (role,), text + hint)
+    missed = summary.innovation_rms_v
+    if missed is None:
+        return
+    text = f"voltage less its prediction: {1e3 * missed:.0f} mV RMS of a cell"
+    if missed < INNOVATION_V:
+        yield right("on board", ("pack_voltage",), f"{text}; the battery's tables are about right")
+    elif missed < POOR_FIT_V or (of and missed < _doubt(of)):
+        yield unknown("on board", ("pack_voltage",), f"{text}; wrong tables, or the cells' number or capacity?")
+    else:
+        yield wrong("on board", ("pack_voltage",), f"{text}: the cells' number or capacity, or the tables")
+
+
+def _doubt(of: PackRide) -> float:
+    """By how much [V] a cell's voltage may miss its prediction for all that the file knows; inf in unmeasured cold."""
+    battery = of.battery
+    if of.temperature < min(battery.r0.temperature) - 2.0:
+        return float("inf")
+    current = np.zeros(1) if of.current is None else of.current[np.isfinite(of.current)]
+    load = sqrt(float(np.mean(current**2))) / battery.cells_parallel if len(current) else 0.0
+    r0, r1, _ = battery.circuit(0.5, of.temperature)
+    return 2.0 * hypot(battery.ocv_sd, battery.resistance_sd * (r0 + r1) * load)
+
+
+# --- text -------------------------------------------------------------------------------------------------------------
 
 
 def check_text(checked: Checked) -> str:
-    """For a terminal."""
-    said, count = "looks right" if checked.those(Looks.RIGHT) else "cannot tell", len(checked.those(Looks.WRONG))
+    """Return the result for a terminal."""
+    head, count = "looks right" if checked.those(Looks.RIGHT) else "cannot tell", len(checked.those(Looks.WRONG))
     if count:
-        often = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles).most_common(2)
-        clear = len(often) == 1 or (len(often) == 2 and often[0][1] > often[1][1])
-        above_all = f", above all {often[0][0]}" if clear else ""
-        said = "one thing looks wrong" if count == 1 else f"{count} things look wrong{above_all}"
-    lines = [f"{checked.file} ({clock(checked.duration_s)}): {said}"]
+        head = "one thing looks wrong" if count == 1 else f"{count} things look wrong"
+    lines = [f"{checked.file} ({clock(checked.duration_s)}): {head}"]
     lines += [f"  {seen.role:21} {_seen_text(seen)}" for seen in checked.roles]
     for looks in (Looks.WRONG, Looks.RIGHT, Looks.UNKNOWN):
-        if those := checked.those(looks):
-            lines += [f"{looks}:", *(f"  {f.check}{_about(f.roles)}: {f.text}" for f in those)]
+        lines += [f"{looks}:"] if checked.those(looks) else []
+        for one in checked.those(looks):
+            roles = f" ({', '.join(one.roles)})" if one.roles else ""
+            lines.append(f"  {one.check}{roles}: {one.text}")
     return "\n".join([*lines, features_text(checked.features)])
-
-
-def _about(roles: Sequence[str]) -> str:
-    return f" ({', '.join(roles)})" if roles else ""
 
 
 def _seen_text(seen: RoleSeen) -> str:

@@ -15,8 +15,7 @@ from gz_onboard.reports.results import Failure, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 from gz_onboard.vehicle_check import new
 from gz_onboard.vehicle_check.check import CHECK_VERSION, Checked, check_log, check_text
-from gz_onboard.vehicle_check.features import features_of, features_text
-from gz_onboard.vehicle_check.finding import Looks
+from gz_onboard.vehicle_check.finding import Looks, features_of, features_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

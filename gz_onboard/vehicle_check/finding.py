@@ -1,10 +1,16 @@
-"""What a check says: that a signal looks right, looks wrong, or that the ride cannot tell."""
+"""Findings of a check, and the features that a vehicle's roles are enough for."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
+
+from gz_onboard.estimator.signals import POSITION
+from gz_onboard.events import SPEEDS, words
+
+Roles = tuple[str, ...]
 
 
 class Looks(StrEnum):
@@ -17,24 +23,118 @@ class Looks(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check says of one or more roles."""
+    """The result of one check, about one or more roles."""
 
     check: Annotated[str, "what was compared"]
     looks: Annotated[Looks, "looks right, looks wrong, or cannot tell"]
-    roles: Annotated[tuple[str, ...], "that it is about"]
+    roles: Annotated[Roles, "that it is about"]
     text: Annotated[str, "what was seen, in words"]
 
 
-def right(check: str, roles: tuple[str, ...], text: str) -> Finding:
-    """Nothing is wrong with it."""
+def right(check: str, roles: Roles, text: str) -> Finding:
+    """Return a finding without a mistake."""
     return Finding(check, Looks.RIGHT, roles, text)
 
 
-def wrong(check: str, roles: tuple[str, ...], text: str) -> Finding:
-    """A suspicion."""
+def wrong(check: str, roles: Roles, text: str) -> Finding:
+    """Return a suspicion."""
     return Finding(check, Looks.WRONG, roles, text)
 
 
-def unknown(check: str, roles: tuple[str, ...], text: str) -> Finding:
-    """The ride does not show it."""
+def unknown(check: str, roles: Roles, text: str) -> Finding:
+    """Return a finding of a ride that does not tell."""
     return Finding(check, Looks.UNKNOWN, roles, text)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """How one signal should follow another.
+
+    usual, possible: ratios of their sizes that look right, and that can be explained. blamed: the roles of a wrong sign
+    or size; by default all. sign, size, hidden, unsure: hints for a wrong sign or size, no correlation, and a possible
+    ratio.
+    """
+
+    check: str
+    roles: Roles
+    close: float  # correlation from which on they go together
+    usual: tuple[float, float] = (0.0, float("inf"))
+    possible: tuple[float, float] | None = None
+    blamed: Roles = ()
+    sign: str = "its sign, scale = -1"
+    hidden: str = "they hardly move together"
+    unsure: str = ""
+
+    def judge(self, correlation: float, ratio: float, text: str, size: str = "") -> Finding:
+        """Return the finding; size: hint for a wrong ratio."""
+        blamed = self.blamed or self.roles
+        if correlation < -self.close:
+            return wrong(self.check, blamed, f"{text}: {self.sign}")
+        if correlation < self.close:
+            return unknown(self.check, self.roles, f"{text}: {self.hidden}")
+        if self.usual[0] < ratio < self.usual[1]:
+            return right(self.check, self.roles, text)
+        if self.possible and self.possible[0] < ratio < self.possible[1]:
+            return unknown(self.check, self.roles, f"{text}: {self.unsure}")
+        return wrong(self.check, blamed, text + size)
+
+
+# --- features ---------------------------------------------------------------------------------------------------------
+
+SPEED = tuple(role for role in SPEEDS if role != "gps_speed")
+NEEDS: dict[str, tuple[tuple[Roles, ...], tuple[Roles, ...]]] = {
+    "range": ((("pack_voltage", "inverter_voltage"), SPEEDS), (("pack_current", "inverter_current"),)),
+    "temperature in the range": ((("cell_temperature",),), (("ambient_temperature",),)),
+    "hills behind": ((("accel_x", "gps_altitude"),), (("accel_x",), ("gps_altitude",), ("rate_x",), ("rate_z",))),
+    "route ahead": ((("latitude",), ("longitude",)), (("gps_fix",),)),
+    "wind by heading": ((("gps_course",),), (("rate_z",),)),
+    "ageing": ((("pack_voltage",), ("pack_current",)), (("cell_temperature",), ("inverter_current",))),
+    "weakest group of cells": ((("lowest_cell_voltage",), ("pack_voltage",), ("pack_current",)), ()),
+    "restart after a break": ((("odometer", "bms_state_of_charge"),), (("odometer",), ("bms_state_of_charge",))),
+    "charging": ((("charge_plug",),), (("pack_current",),)),
+    "parked or riding": ((("key", "contactor"),), ()),
+    "riders told apart": ((("rider",),), ()),
+    "sensors checked": (
+        (("inverter_voltage", "inverter_current", *SPEEDS[1:]),),
+        (("inverter_voltage",), ("inverter_current",), ("gps_speed", "wheel_speed_front"), ("accel_x",)),
+    ),
+    "discovery": (
+        (SPEED, ("motor_current", "motor_torque", "pack_current"), ("pack_voltage",)),
+        (("motor_current",), ("inverter_current",), ("accel_x",), POSITION),
+    ),
+}
+"""By feature: what it needs, and what makes it better; of each group one role."""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature and its missing roles; of each group in `missing` and `better` one role would do."""
+
+    name: Annotated[str, "name of the feature"]
+    works: Annotated[bool, "whether what it needs is there"]
+    missing: Annotated[list[list[str]], "what it needs and is not there: one of each"]
+    better: Annotated[list[list[str]], "what would make it better, likewise"]
+
+
+def features_of(roles: Collection[str]) -> list[Feature]:
+    """Return every feature, for a vehicle with these `roles`."""
+    found = []
+    for name, (needed, wanted) in NEEDS.items():
+        missing = [list(group) for group in needed if not set(group) & set(roles)]
+        better = [list(group) for group in wanted if not set(group) & set(roles) and list(group) not in missing]
+        found.append(Feature(name, not missing, missing, better))
+    return found
+
+
+def features_text(features: Sequence[Feature]) -> str:
+    """List the features and their missing roles, for a terminal."""
+
+    def one_of(groups: list[list[str]]) -> str:
+        return "; ".join(" or ".join(words(role) for role in group) for group in groups)
+
+    lines = ["features:"]
+    for feature in features:
+        better = f"; better with {one_of(feature.better)}" if feature.better else ""
+        text = f"yes{better}" if feature.works else f"no: lacks {one_of(feature.missing)}"
+        lines.append(f"  {feature.name:24} {text}")
+    return "\n".join(lines)

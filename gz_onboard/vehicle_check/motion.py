@@ -1,310 +1,345 @@
-"""Whether what a log says of the motion fits together: speeds, odometer, positions, accelerations, turning."""
+"""Speeds, odometer and positions against each other; accelerations and turning against the speed.
+
+Each source of the way that was ridden is compared with one speed. The scale on which most independent sources agree is
+taken as right: all wheels together are one source, for they need the file's radius. A wrong sign or size is reported
+once and then corrected, so that later checks accuse nothing else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import EARTH_RADIUS, GRAVITY
-from gz_onboard.estimator.plausibility.motion import AXLE, GROUND, vote
+from gz_onboard.estimator.plausibility.motion import AXLE, GROUND
 from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.events import SPEEDS
 from gz_onboard.model.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
-from gz_onboard.vehicle_check.finding import Finding, right, unknown, wrong
-from gz_onboard.vehicle_check.seconds import FEWEST, SECOND, Seconds, rate, relation, too_little, unit_of
+from gz_onboard.vehicle_check.finding import Expected, Finding, Looks, Roles, right, unknown, wrong
+from gz_onboard.vehicle_check.seconds import FEWEST, SECOND, Seconds, rate, relation, unit_of
 
-ROLLING = AXLE | {"wheel_speed_front"}  # their speed is by the radius
-BENCH = "a roller bench"
-SIGN = "speed's sign"
-SHORTEST = 300.0  # m, over which two distances are compared
-STRETCH = 10  # s, over which positions are compared with a speed
-FEW = 5  # stretches at least
-UNLIKE = 0.05  # relative: on 17 recorded rides the way of a stretch was 1 to 3 % off, exchanged 6 to 97 %
-POLE = 90.0  # deg
-COUNTS = 5  # steps of the odometer, likewise
-ODOMETER_ERRS = 0.05  # relative: so far it may be off the way by what it counts, and more by a wrong radius
-EXACT = 0.01  # of its way: an odometer of no greater steps tells a few percent
-LEVEL = 2.5  # m/s²: by so much the gravity that an axis shows may be off, by bias, mounting and hills
-SWINGS = 0.25  # m/s²: an acceleration that moves by less, as a standard deviation, shows nothing
-CLOSE = 0.4  # a correlation from here on is one: hills, bends and shaking are in an accelerometer too
-FACTORS = (0.6, 1.7)  # of an acceleration, likewise
-ROUGH = 0.2  # relative: of a factor of accelerations
-TURNING = 0.03  # rad/s
-TURN_FACTORS = (0.6, 1.6)
+BY_WAYS, BY_FILE = "ways against each other", "wheel radius and gear ratio"
+WHEELS = ("motor_speed", "wheel_speed_rear", "wheel_speed_front")
+ODOMETER, POSITIONS = "odometer", "positions"
+PLACE = ("latitude", "longitude")
 
 
-def speeds_of(ride: Seconds, vehicle: Vehicle) -> dict[str, Array]:
-    """Every speed of the ride [m/s] by role, (n,)."""
+@dataclass(frozen=True)
+class MotionConfig:
+    """Tolerances. Recorded rides: 29 are within 0.8 % of the GPS, three with soft tyres 1.1 %."""
+
+    apart: float = 0.04  # relative, of two ways that agree
+    odometer_apart: float = 0.05  # relative, and twice its steps
+    shortest_m: float = 300.0  # way that is compared
+    odometer_steps: int = 5  # at least
+    stretch_s: int = 10  # over which the shape of positions is compared with the speed
+    misfit: float = 0.05  # relative: 17 recorded rides have 0.01 to 0.03, exchanged positions 0.06 to 0.97
+    level_m_s2: float = 2.5  # by which gravity on an axis may be off, by bias, mounting and hills
+    swing_m_s2: float = 0.25  # standard deviation of an acceleration that shows something
+    turning_rad_s: float = 0.03  # likewise, of a yaw rate
+    close: float = 0.4  # correlation: hills, bends and shaking are in an accelerometer too
+    rough: float = 0.2  # relative tolerance of a unit told by accelerations
+
+
+SETTINGS = MotionConfig()
+FORWARD = ("accel_x",)
+TURNING = Expected(
+    "turning against course",
+    ("rate_z", "gps_course"),
+    SETTINGS.close,
+    (0.6, 1.6),
+    sign="the sign of one; rate_z is positive to the left, the course to the right",
+    hidden="too noisy",
+)
+
+
+@dataclass
+class Speeds:
+    """Speeds [m/s] by role, (n,), without the mistakes that were found. sure: sources agree on their size."""
+
+    speeds: dict[str, Array]
+    findings: list[Finding] = field(default_factory=list)
+    sure: bool = True
+    bench: bool = False  # the driven axle turns, the ground stands
+
+    @property
+    def best(self) -> str | None:
+        """The speed that others are compared with."""
+        wrong_roles = {role for one in self.findings if one.looks is Looks.WRONG for role in one.roles}
+        return min(self.speeds, key=lambda role: role in wrong_roles, default=None)
+
+
+def check_speeds(ride: Seconds, vehicle: Vehicle) -> Speeds:
+    """Compare all that shows the way that was ridden."""
     p = vehicle.parameters
     factors = speed_factors(p["wheel_radius"], p["gear_ratio"])
-    return {role: factors[role] * ride[role] for role in ride.any_of(*SPEEDS)}
-
-
-def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
-    """The speeds by majority, as on board, in their mean over what was ridden."""
-    check = "speeds against each other"
-    for role, speed in speeds.items():
-        top = float(np.nanmax(np.abs(speed)))
-        if top > CONFIG.fastest_m_s:
-            yield wrong("speed", (role,), f"reaches {3.6 * top:.0f} km/h by the radius and gear ratio of the file")
+    found = Speeds({role: factors[role] * ride[role] for role in ride.any_of(*SPEEDS)})
+    for role, speed in found.speeds.items():
         if float(np.nanmean(speed)) < -CONFIG.speed_sd_m_s:
-            yield wrong(SIGN, (role,), "is negative while riding: give scale = -1")
-    known = np.all(np.isfinite(list(speeds.values())), axis=0) if speeds else np.zeros(0, dtype=bool)
-    moving = (
-        known & (np.max(np.abs(list(speeds.values())), axis=0, initial=0.0) > CONFIG.moving_m_s) if speeds else known
-    )
-    roles = tuple(speeds)
-    if moving.sum() < FEWEST:
-        if roles:
-            fastest = np.max(np.abs(np.nan_to_num(list(speeds.values()))), axis=0)
-            yield unknown(check, roles, too_little(fastest, " and ".join(roles)))
-        return
-    means = {role: float(np.mean(np.abs(speed[moving]))) for role, speed in speeds.items()}
-    if len(roles) < 2:
-        yield unknown(check, roles, "there is no other speed to compare it with")
-        return
-    if _on_bench(means):
-        yield unknown(check, roles, f"the driven axle turns and the ground stands: {BENCH}")
-        return
-    apart = {role: CONFIG.speed_sd_m_s / 2 + CONFIG.speed_sd_relative * mean for role, mean in means.items()}
-    outvoted, tied = vote(means, apart, spins=False)
-    yield from _speed_verdicts(check, means, outvoted, tied)
+            found.findings.append(wrong("speed's sign", (role,), "is negative while riding: give scale = -1"))
+            found.speeds[role] = -speed
+    if found.speeds:
+        pivot = next(role for role in ("wheel_speed_rear", *SPEEDS) if role in found.speeds)
+        _compare(ride, found, pivot, vehicle)
+        for role, speed in found.speeds.items():
+            if found.sure and (top := float(np.nanmax(np.abs(speed)))) > CONFIG.fastest_m_s:
+                found.findings.append(wrong("speed", (role,), f"reaches {3.6 * top:.0f} km/h"))
+    elif set(PLACE) <= ride.columns.keys():
+        found.findings += _poles(ride)
+    return found
 
 
-def _on_bench(means: dict[str, float]) -> bool:
-    """Whether the driven axle turns and all else stands; means: of each speed [m/s]."""
-    ground = [role for role in means if role in GROUND]
-    stands = all(means[role] < CONFIG.speed_sd_m_s for role in ground) and bool(AXLE & means.keys())
-    return stands and (len(ground) > 1 or not means.keys() - AXLE - set(ground))
-
-
-def _speed_verdicts(
-    check: str, means: dict[str, float], outvoted: frozenset[str], tied: frozenset[str]
-) -> Iterator[Finding]:
-    others = {role: mean for role, mean in means.items() if role not in outvoted}
-    if tied:
-        shown = ", ".join(f"{role} {3.6 * mean:.1f} km/h" for role, mean in means.items())
-        a, b = min(means, key=lambda role: means[role]), max(means, key=lambda role: means[role])
-        like = unit_of(b, means[b] / means[a]) if means[a] > 0 else ""
-        yield wrong(
-            check, tuple(sorted(tied)), f"they contradict each other, and none decides: {shown} in the mean{like}"
-        )
+def _compare(ride: Seconds, found: Speeds, pivot: str, vehicle: Vehicle) -> None:
+    """Judge each way over that of the speed `pivot`, and correct the speeds."""
+    reference, roles = np.abs(found.speeds[pivot]), tuple(found.speeds)
+    ratios = {pivot: 1.0}
+    for role in roles:
+        ratio = _way_over(np.abs(found.speeds[role]), reference)
+        if ratio is not None:
+            ratios[role] = ratio
+    seconds = int(np.sum(np.max(np.abs(np.nan_to_num(list(found.speeds.values()))), axis=0) > CONFIG.moving_m_s))
+    if seconds < FEWEST:
+        text = f"the vehicle moves for {seconds} s in this log, and {FEWEST} s are needed"
+        found.findings.append(unknown(BY_WAYS, roles, text))
+        found.findings += _poles(ride)
         return
-    middle = float(np.median(list(others.values())))
-    for role in sorted(outvoted):
-        ratio = means[role] / middle
-        yield wrong(check, (role,), f"shows {ratio:.3g} times what {', '.join(others)} show{unit_of(role, ratio)}")
-    if len(others) > 1:
-        spread = max(others.values()) / min(others.values()) - 1
-        yield right(check, tuple(others), f"{' and '.join(others)} agree within {spread:.1%}")
+    ground = [role for role in ratios if role in GROUND]
+    if ground and pivot in AXLE and (len(ground) > 1 or "vehicle_speed" not in ratios):
+        found.bench = all(float(np.nanmean(np.abs(found.speeds[role]))) < CONFIG.speed_sd_m_s for role in ground)
+    if found.bench:
+        found.findings.append(unknown(BY_WAYS, roles, "the driven axle turns and the ground stands: a roller bench"))
+        return
+    tolerances = dict.fromkeys(ratios, SETTINGS.apart)
+    for name, way in (
+        (ODOMETER, _odometer(ride, found, pivot, reference)),
+        (POSITIONS, _positions(ride, found, pivot, reference)),
+    ):
+        if way:
+            ratios[name], tolerances[name] = way
+    agreeing = [
+        [other for other in ratios if abs(ratios[other] / ratios[name] - 1) < tolerances[other]]
+        for name in ratios
+        if name != ODOMETER  # its steps are too coarse to be a reference
+    ]
+    if len(ratios) < 2:
+        found.findings.append(unknown(BY_WAYS, roles, "there is no other way to compare it with"))
+        return
+    inside = max(agreeing, key=lambda names: (len(_independent(names)), len(names)))
+    if len(_independent(inside)) > 1 or len(_independent(ratios)) == 1:
+        _outliers(found, pivot, ratios, inside, vehicle)
+    else:
+        _undecided(found, pivot, ratios, vehicle)
+
+
+def _independent(names: Mapping[str, float] | list[str]) -> set[str]:
+    return {"wheels" if name in WHEELS else name for name in names}
+
+
+def _way_over(speed: Array, reference: Array) -> float | None:
+    """The way by `speed` over that by `reference`, both (n,) [m/s]; None if they are seldom there together."""
+    known = np.isfinite(speed) & np.isfinite(reference)
+    moving = known & (np.maximum(speed, reference) > CONFIG.moving_m_s)
+    if moving.sum() < FEWEST or not reference[moving].sum():
+        return None
+    return float(speed[moving].sum() / reference[moving].sum())
+
+
+def _roles_of(name: str) -> Roles:
+    return PLACE if name == POSITIONS else (name,)
+
+
+def _outliers(found: Speeds, pivot: str, ratios: dict[str, float], inside: list[str], vehicle: Vehicle) -> None:
+    """Report what disagrees with the sources `inside`, and correct it."""
+    p, scale = vehicle.parameters, float(np.median([ratios[name] for name in inside]))
+    wheels = [name for name in WHEELS if name in ratios]
+    lost = [name for name in wheels if name not in inside]
+    others = " and ".join(inside)
+    if len(inside) > 1:
+        spread = max(ratios[name] for name in inside) / min(ratios[name] for name in inside) - 1
+        roles = tuple(role for name in inside for role in _roles_of(name))
+        found.findings.append(right(BY_WAYS, roles, f"{others} agree within {spread:.1%}"))
+    together = len(lost) > 1 and max(ratios[name] for name in lost) / min(ratios[name] for name in lost) < 1.04
+    for name in ratios.keys() - set(inside):
+        off = ratios[name] / scale
+        roles, unit = _roles_of(name), unit_of(name, off) if name != POSITIONS else ""
+        text = f"{name} is {off:.3g} times {others}"
+        if name not in wheels or (unit and not together) or (name != "motor_speed" and len(lost) < len(wheels)):
+            found.findings.append(wrong(BY_WAYS, roles, text + unit))
+        elif len(lost) < len(wheels):
+            gear = p["gear_ratio"]
+            hint = f"{gear / off:.4g} would fit, or the scale of {name} is wrong"
+            found.findings.append(wrong(BY_FILE, roles, f"by the file's gear_ratio {gear:.4g} {text}; {hint}"))
+        elif name == pivot or not together:
+            named, length = "wheel_radius", p["wheel_radius"]
+            if wheels == ["motor_speed"]:
+                named, length = "wheel_radius times gear_ratio", length * p["gear_ratio"]
+            hint = "" if together else f", or the scale of {name} is wrong"
+            text = f"by the file's {named} {length:.4g} m {text}; {length / off:.4g} m would fit{hint}"
+            found.findings.append(wrong(BY_FILE, () if together else roles, text))
+    for role in found.speeds:
+        if role in ratios:
+            right_ratio = 1.0 if role in inside else scale / ratios[role]
+            found.speeds[role] = found.speeds[role] * right_ratio
+
+
+def _undecided(found: Speeds, pivot: str, ratios: dict[str, float], vehicle: Vehicle) -> None:
+    """Report sources of which no two agree."""
+    found.sure = False
+    low, high = (f(ratios, key=lambda name: ratios[name]) for f in (min, max))
+    off = ratios[high] / ratios[low]
+    shown = ", ".join(f"{name} {ratio:.3g}" for name, ratio in ratios.items())
+    text = f"they contradict each other, and none decides: in proportion {shown}"
+    hint = "" if POSITIONS in (low, high) else unit_of(high, off)
+    other = [name for name in ratios if name not in WHEELS]
+    if not hint and len(other) == 1 and pivot in WHEELS:
+        fits = vehicle.parameters["wheel_radius"] * ratios[other[0]]
+        hint = f"; wheel_radius {fits:.4g} m would fit, or gear_ratio or a scale is wrong"
+    looks = unknown if set(other) == {ODOMETER} and off < 1 + CONFIG.odometer_sd else wrong
+    roles = tuple(role for name in ratios for role in _roles_of(name))
+    found.findings.append(looks(BY_WAYS, roles, text + hint))
+
+
+def _odometer(ride: Seconds, found: Speeds, pivot: str, speed: Array) -> tuple[float, float] | None:
+    """(way of the odometer over that by `speed` (n,) [m/s], tolerance); None if it cannot be compared."""
+    if ODOMETER not in ride:
+        return None
+    known = np.isfinite(ride[ODOMETER]) & np.isfinite(speed)
+    steps = np.diff(ride[ODOMETER][known])
+    counts, ridden = steps[steps > 0], float(speed[known].sum()) * SECOND
+    counted, largest = float(counts.sum()), float(counts.max(initial=0.0))
+    if (steps < -1.0).any():
+        found.findings.append(wrong(ODOMETER, (ODOMETER,), "counts back"))
+    elif max(counted, ridden) < max(SETTINGS.shortest_m, SETTINGS.odometer_steps * largest) or (
+        not counted and ridden < 2500
+    ):
+        found.findings.append(unknown(ODOMETER, (ODOMETER,), f"{ridden:.0f} m are too few for its steps"))
+    elif not counted:
+        found.findings.append(wrong(ODOMETER, (ODOMETER,), f"stands while {pivot} goes {ridden / 1e3:.1f} km"))
+    elif ridden:
+        return counted / ridden, max(SETTINGS.odometer_apart, 2 * largest / counted)
+    return None
+
+
+def _positions(ride: Seconds, found: Speeds, pivot: str, speed: Array) -> tuple[float, float] | None:
+    """(way of the positions over that by `speed` (n,) [m/s], tolerance); None if it cannot be compared."""
+    if not set(PLACE) <= ride.columns.keys():
+        return None
+    if poles := _poles(ride):
+        found.findings += poles
+        return None
+    latitude, longitude = (ride[role] for role in PLACE)
+    moving = np.isfinite(latitude) & np.isfinite(longitude) & (np.nan_to_num(speed) > CONFIG.moving_m_s)
+    both = moving[:-1] & moving[1:]
+    by_speed = np.where(both, (speed[:-1] + speed[1:]) / 2, 0.0) * SECOND
+    steps, exchanged = (_steps(a, b, both) for a, b in ((latitude, longitude), (longitude, latitude)))
+    off, off_exchanged = _misfit(steps, by_speed), _misfit(exchanged, by_speed)
+    ridden, way = float(by_speed.sum()), float(steps.sum())
+    text = f"{pivot} goes {ridden / 1e3:.2f} km, the positions {way / 1e3:.2f} km"
+    if ridden < SETTINGS.shortest_m:
+        found.findings.append(unknown(POSITIONS, PLACE, f"{ridden:.0f} m were ridden with positions"))
+    elif off > SETTINGS.misfit and off_exchanged < off / 2:
+        said = f"in stretches of {SETTINGS.stretch_s} s they are {off:.0%} off, and exchanged {off_exchanged:.0%}"
+        found.findings.append(wrong(POSITIONS, PLACE, f"swapped: {said}"))
+    elif way < SETTINGS.shortest_m / 10:
+        found.findings.append(wrong(POSITIONS, PLACE, f"stuck: {text}"))
+    else:
+        return way / ridden, SETTINGS.apart
+    return None
+
+
+def _poles(ride: Seconds) -> list[Finding]:
+    """There is no latitude beyond the poles."""
+    if not set(PLACE) <= ride.columns.keys():
+        return []
+    most, other = (float(np.nanmax(np.abs(ride[role]))) for role in PLACE)
+    if most <= 90.0:
+        return []
+    why = "swapped with the longitude" if other <= 90.0 else "a wrong scale in the DBC file, or unit"
+    return [wrong(POSITIONS, PLACE, f"the latitude reaches {most:.1f}°, beyond the poles: {why}")]
 
 
 def _steps(latitude: Array, longitude: Array, moving: Mask) -> Array:
-    """The way [m] (n - 1,) from each position [deg] to the next, 0 where it is not `moving` (n,)."""
+    """The way [m] (n - 1,) from each position [deg] to the next, 0 where it is not `moving` (n - 1,)."""
     north = np.radians(np.diff(latitude)) * EARTH_RADIUS
     east = np.radians(np.diff(longitude)) * EARTH_RADIUS * np.cos(np.radians(latitude[:-1]))
-    return np.where(moving[:-1] & moving[1:], np.hypot(north, east), 0.0)
+    return np.where(moving, np.hypot(north, east), 0.0)
 
 
 def _misfit(steps: Array, ridden: Array) -> float:
-    """How far the way by positions is off that by the speed (n,) [m], stretch by stretch, in the mean, relative.
+    """Mean relative difference of two ways (n,) [m] in stretches, both scaled to one length in all.
 
-    Of both as long in all: a wrong scale of the speed makes none. To the north and to the east the way is in degrees of
-    unlike lengths, so exchanged positions have one wherever the ride turns. 0 of fewer than `FEW` stretches.
+    A wrong scale of the speed makes none, exchanged positions do wherever the ride turns: a degree to the north and one
+    to the east are not of one length. 0 of fewer than five stretches.
     """
-    count = len(steps) // STRETCH
-    way, by_speed = (x[: count * STRETCH].reshape(count, STRETCH).sum(axis=1) for x in (steps, ridden))
-    if np.count_nonzero(by_speed) < FEW or not way.sum():
+    count = len(steps) // SETTINGS.stretch_s
+    ways = (x[: count * SETTINGS.stretch_s].reshape(count, SETTINGS.stretch_s).sum(axis=1) for x in (steps, ridden))
+    way, by_speed = ways
+    if np.count_nonzero(by_speed) < 5 or not way.sum():
         return 0.0
     return float(np.abs(way * by_speed.sum() / way.sum() - by_speed).sum() / by_speed.sum())
 
 
-def check_distances(
-    ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str], radius: float | None = None
-) -> Iterator[Finding]:
-    """The way by the best speed against that of the odometer and of the positions; radius: of the driven wheel [m]."""
-    best = next((role for role in speeds if role not in doubted), next(iter(speeds), None))
-    if {"latitude", "longitude"} <= ride.columns.keys():
-        yield from _poles(ride["latitude"], ride["longitude"])
-    if best is None:
-        return
-    speed = np.abs(speeds[best])
-    if "odometer" in ride:
-        alone = best in ROLLING and not {"gps_speed", "latitude"} & ride.columns.keys()
-        yield from _odometer(ride["odometer"], best, speed, radius if alone else None)
-    if {"latitude", "longitude"} <= ride.columns.keys() and float(np.nanmax(np.abs(ride["latitude"]))) <= POLE:
-        yield from _positions(ride, best, speed)
+# --- accelerations and turning ----------------------------------------------------------------------------------------
 
 
-def _counts(odometer: Array, speed: Array) -> tuple[Array, float, bool]:
-    """(steps forward of the odometer [m], way by the speed [m], whether both are enough to compare); both (n,)."""
-    known = np.isfinite(odometer) & np.isfinite(speed)
-    steps = np.diff(odometer[known])
-    counts = steps[steps > 0]
-    counted, ridden = float(counts.sum()), float(speed[known].sum()) * SECOND
-    largest = float(counts.max()) if len(counts) else 0.0
-    few = max(counted, ridden) < max(SHORTEST, COUNTS * largest) or (not len(counts) and ridden < 2500)
-    return counts, ridden, not few
-
-
-def way_over_odometer(ride: Seconds, speed: Array) -> float | None:
-    """The way by the speed (n,) [m/s] over that of the odometer; None if too little of it was seen, or it is faulty."""
-    if "odometer" not in ride or (np.diff(ride["odometer"]) < -1.0).any():
-        return None
-    counts, ridden, enough = _counts(ride["odometer"], np.abs(speed))
-    exact = len(counts) and float(counts.max()) < EXACT * float(counts.sum())
-    return ridden / float(counts.sum()) if enough and exact else None
-
-
-def _odometer(odometer: Array, best: str, speed: Array, radius: float | None) -> Iterator[Finding]:
-    """radius: of the wheel [m], if nothing but the odometer tells whether it is right."""
-    check, roles = "speed against odometer", (best, "odometer")
-    if (np.diff(odometer[np.isfinite(odometer) & np.isfinite(speed)]) < -1.0).any():
-        yield wrong("odometer", ("odometer",), "counts back")
-        return
-    counts, ridden, enough = _counts(odometer, speed)
-    counted, largest = float(counts.sum()), float(counts.max()) if len(counts) else 0.0
-    if not enough:
-        yield unknown(check, roles, f"{ridden:.0f} m are too few for its steps")
-        return
-    if not counted:
-        yield wrong(check, ("odometer",), f"stands while {best} goes {ridden / 1e3:.1f} km")
-        return
-    ratio = ridden / counted
-    text = f"{best} goes {ridden / 1e3:.2f} km, the odometer {counted / 1e3:.2f} km"
-    off = abs(ridden - counted)
-    if off <= max(CONFIG.odometer_sd * max(ridden, counted), 2 * largest):
-        if radius is None or off <= max(ODOMETER_ERRS * max(ridden, counted), 2 * largest):
-            yield right(check, roles, text)
-            return
-        name = "gear_ratio" if best == "motor_speed" else f"the scale of {best}"
-        fits = f"wheel_radius {radius / ratio:.4g} m would fit in place of {radius:.4g} m; or {name}"
-        yield unknown(check, roles, f"{text}: {fits} or the odometer is wrong, and no GPS tells which")
-    else:
-        yield wrong(check, roles, f"{text}, {ratio:.3g} times{unit_of(best, ratio) or unit_of('odometer', 1 / ratio)}")
-
-
-def _poles(latitude: Array, longitude: Array) -> Iterator[Finding]:
-    """There is no latitude beyond the poles."""
-    most, other = (float(np.nanmax(np.abs(x))) for x in (latitude, longitude))
-    if most > POLE:
-        why = "swapped with the longitude" if other <= POLE else "a wrong scale in the DBC file, or unit"
-        yield wrong(
-            "positions", ("latitude", "longitude"), f"the latitude reaches {most:.1f}°, beyond the poles: {why}"
-        )
-
-
-def _where(ride: Seconds, speed: Array) -> tuple[Array, Mask]:
-    """(the way [m] (n - 1,) by `speed` (n,) from each position to the next, 0 where it does not move; where it does)"""
-    known = np.isfinite(ride["latitude"]) & np.isfinite(ride["longitude"]) & np.isfinite(speed)
-    moving = known & (speed > CONFIG.moving_m_s)
-    return np.where(moving[:-1] & moving[1:], (speed[:-1] + speed[1:]) / 2, 0.0) * SECOND, moving
-
-
-def way_over_positions(ride: Seconds, speed: Array) -> float | None:
-    """The way by the speed (n,) [m/s] over that of the positions; None if too little was seen, or they do not fit."""
-    if not {"latitude", "longitude"} <= ride.columns.keys():
-        return None
-    by_speed, moving = _where(ride, np.abs(speed))
-    steps = _steps(ride["latitude"], ride["longitude"], moving)
-    if by_speed.sum() < SHORTEST or steps.sum() < SHORTEST or _misfit(steps, by_speed) > UNLIKE:
-        return None
-    return float(by_speed.sum() / steps.sum())
-
-
-def _positions(ride: Seconds, best: str, speed: Array) -> Iterator[Finding]:
-    check, roles = "speed against positions", (best, "latitude", "longitude")
-    latitude, longitude = ride["latitude"], ride["longitude"]
-    by_speed, moving = _where(ride, speed)
-    ridden = float(by_speed.sum())
-    if ridden < SHORTEST:
-        yield unknown(check, roles, f"{ridden:.0f} m were ridden with positions")
-        return
-    steps, turned_steps = _steps(latitude, longitude, moving), _steps(longitude, latitude, moving)
-    way, turned = float(steps.sum()), float(turned_steps.sum())
-    off, turned_off = _misfit(steps, by_speed), _misfit(turned_steps, by_speed)
-    text = f"{best} goes {ridden / 1e3:.2f} km, the positions {way / 1e3:.2f} km"
-    if off > UNLIKE and turned_off < off / 2:
-        said = f"in stretches of {STRETCH} s they are {off:.0%} off {best}, and exchanged {turned_off:.0%}"
-        yield wrong("positions", ("latitude", "longitude"), f"swapped: {said}")
-    elif abs(way / ridden - 1) < CONFIG.odometer_sd:
-        yield right(check, roles, text)
-    elif abs(turned / ridden - 1) < CONFIG.odometer_sd and turned_off < off + UNLIKE / 2:
-        yield wrong("positions", ("latitude", "longitude"), f"swapped: {text}, and exchanged {turned / 1e3:.2f} km")
-    elif way < SHORTEST / 10:
-        yield wrong("positions", ("latitude", "longitude"), f"stuck: {text}")
-    else:
-        yield wrong(check, roles, f"{text}{unit_of(best, ridden / way)}")
-
-
-def check_accelerations(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str]) -> Iterator[Finding]:
-    """Gravity along the vertical axis alone; the forward one against the change of speed."""
+def check_accelerations(ride: Seconds, speeds: Speeds) -> Iterator[Finding]:
+    """Gravity on the vertical axis alone; the forward axis against the change of speed."""
     for role, gravity in (("accel_x", 0.0), ("accel_y", 0.0), ("accel_z", GRAVITY)):
         if role not in ride:
             continue
-        mean, check = float(np.nanmean(ride[role])), "gravity"
-        if abs(mean - gravity) < LEVEL:
+        mean, level = float(np.nanmean(ride[role])), SETTINGS.level_m_s2
+        text = f"shows {mean:.2f} m/s² in the mean"
+        if abs(mean - gravity) < level:
             if gravity:
-                yield right(check, (role,), f"shows {mean:.2f} m/s² in the mean, up")
-        elif gravity and abs(mean + gravity) < LEVEL:
-            yield wrong(check, (role,), f"shows {mean:.2f} m/s²: its sign, scale = -1")
+                yield right("gravity", (role,), f"{text}, up")
+        elif gravity and abs(mean + gravity) < level:
+            yield wrong("gravity", (role,), f"{text}: its sign, scale = -1")
         elif gravity and abs(mean - 1) < 0.2:
-            yield wrong(check, (role,), f"shows {mean:.2f}{unit_of(role, mean / gravity) or ': g taken for m/s²'}")
-        elif not gravity and abs(abs(mean) - GRAVITY) < LEVEL:
-            yield wrong(check, (role,), f"shows {mean:.2f} m/s² in the mean: the vertical axis, swapped")
+            yield wrong("gravity", (role,), f"{text}: g taken for m/s²")
+        elif not gravity and abs(abs(mean) - GRAVITY) < level:
+            yield wrong("gravity", (role,), f"{text}: the vertical axis, swapped")
         else:
-            yield wrong(check, (role,), f"shows {mean:.2f} m/s² in the mean, where {gravity:.1f} is expected")
-    best = next((role for role in speeds if role not in doubted), None)
-    if best and "accel_x" in ride:
-        yield _forward(ride, best, speeds[best], len(speeds) - len(doubted & speeds.keys()) > 1)
+            yield wrong("gravity", (role,), f"{text}, where {gravity:.1f} is expected")
+    if speeds.best and "accel_x" in ride:
+        yield _forward(ride, speeds, speeds.best)
 
 
-def _forward(ride: Seconds, best: str, speed: Array, sure: bool) -> Finding:
-    """sure: other speeds agree with `best`."""
-    check, roles = "acceleration against speed", ("accel_x", best)
-    change = rate(speed)
-    if np.nanstd(change) < SWINGS:
-        return unknown(check, roles, "the speed hardly changes")
-    found = relation(change, ride["accel_x"])
+def _forward(ride: Seconds, speeds: Speeds, best: str) -> Finding:
+    change, roles = rate(speeds.speeds[best]), ("accel_x", best)
+    blamed = FORWARD if speeds.sure else roles
+    expected = Expected(
+        "acceleration against speed",
+        roles,
+        SETTINGS.close,
+        (0.6, 1.7),
+        blamed=blamed,
+        hidden="hills and shaking hide it",
+    )
+    found = relation(change, ride["accel_x"]) if np.nanstd(change) > SETTINGS.swing_m_s2 else None
     if found is None:
-        return unknown(check, roles, "they are not there together")
+        return unknown(expected.check, roles, "the speed hardly changes, or they are not there together")
     sideways = relation(change, ride["accel_y"]) if "accel_y" in ride else None
-    if sideways and abs(sideways.correlation) > max(CLOSE, abs(found.correlation) + 0.3):
-        return wrong(
-            check, ("accel_x", "accel_y"), "accel_y goes with the change of speed, and accel_x does not: swapped"
-        )
+    if sideways and abs(sideways.correlation) > max(SETTINGS.close, abs(found.correlation) + 0.3):
+        text = "accel_y goes with the change of speed, and accel_x does not: swapped"
+        return wrong(expected.check, ("accel_x", "accel_y"), text)
     text = f"goes with the change of {best}, factor {found.factor:.2f}, correlation {found.correlation:.2f}"
-    if found.correlation < -CLOSE:
-        return wrong(check, ("accel_x",), f"{text}: its sign, scale = -1")
-    if found.correlation < CLOSE:
-        return unknown(check, roles, f"{text}: hills and shaking hide it")
-    if FACTORS[0] < found.factor < FACTORS[1]:
-        return right(check, roles, text)
-    by_speed = "" if sure else unit_of(best, 1 / found.factor, ROUGH)
-    return wrong(check, roles[:1] if sure else roles, text + (by_speed or unit_of("accel_x", found.factor, ROUGH)))
+    return expected.judge(found.correlation, found.factor, text, unit_of("accel_x", found.factor, SETTINGS.rough))
 
 
-def check_turning(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
-    """The turning to the left against the change of course."""
-    if not {"rate_z", "gps_course"} <= ride.columns.keys() or not speeds:
+def check_turning(ride: Seconds, speeds: Speeds) -> Iterator[Finding]:
+    """The yaw rate against the change of course."""
+    if not {"rate_z", "gps_course"} <= ride.columns.keys() or not speeds.best:
         return
-    check, roles = "turning against course", ("rate_z", "gps_course")
-    fast = np.abs(next(iter(speeds.values()))) > 2 * CONFIG.moving_m_s
+    fast = np.abs(speeds.speeds[speeds.best]) > 2 * CONFIG.moving_m_s
     turning = -rate(ride["gps_course"])
     turning = np.where(np.abs(turning) < 1.0, turning, np.nan)
     found = relation(turning, ride["rate_z"], fast)
-    if found is None or float(np.nanstd(turning[fast])) < TURNING:
-        yield unknown(check, roles, "too few bends with a GPS course")
+    if found is None or float(np.nanstd(turning[fast])) < SETTINGS.turning_rad_s:
+        yield unknown(TURNING.check, TURNING.roles, "too few bends with a GPS course")
         return
     text = f"factor {found.factor:.2f}, correlation {found.correlation:.2f}"
-    if found.correlation < -CLOSE:
-        yield wrong(check, roles, f"{text}: the sign of one; rate_z is positive to the left, the course to the right")
-    elif found.correlation < CLOSE:
-        yield unknown(check, roles, f"{text}: too noisy")
-    elif TURN_FACTORS[0] < found.factor < TURN_FACTORS[1]:
-        yield right(check, roles, text)
-    else:
-        yield wrong(check, roles, text + unit_of("rate_z", found.factor))
+    yield TURNING.judge(found.correlation, found.factor, text, unit_of("rate_z", found.factor))

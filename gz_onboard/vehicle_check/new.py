@@ -23,7 +23,7 @@ from gz_onboard.model.parameters import MOST_CELLS, declared_parameters
 from gz_onboard.options import number
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
-from gz_onboard.vehicle_check.features import features_of, features_text
+from gz_onboard.vehicle_check.finding import features_of, features_text
 
 FINE_RANGE_WH = 5000.0  # the fine scale of the range frames ends at 6500 Wh
 WIRES = 0.1  # of the cells' R0

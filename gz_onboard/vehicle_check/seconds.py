@@ -1,4 +1,4 @@
-"""A ride on one grid of a second, and what two signals of it say of each other."""
+"""A ride on a grid of one second, and how two signals of it compare."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.can.mapping import UNITS, known_units, to_si
 from gz_onboard.discovery.grid import averaged, delays, measured
-from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.offline.sensors import true_columns
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
@@ -20,7 +19,6 @@ SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged 
 FEWEST = 30  # points that two signals must have together before they say anything of each other
 ALIKE = 0.06  # relative: a ratio that is so near that of two units is theirs
 RARER = 0.02  # relative: so much nearer it must be to a power of ten, or to two units that are both not of SI
-UNRELATED = 0.2  # a correlation below says that two signals have nothing to do with each other
 
 
 @dataclass(frozen=True)
@@ -90,31 +88,22 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
     return Relation(copysign(height / width, correlation), correlation, int(known.sum()))
 
 
-def too_little(speed: Array, what: str) -> str:
-    """Say why `what` cannot be compared: too little motion at this `speed` (n,) [m/s], or they are not there."""
-    moving = int(np.sum(np.abs(speed) > CONFIG.moving_m_s))
-    if moving < FEWEST:
-        return f"the vehicle moves for {moving} s in this log, and {FEWEST} s are needed"
-    return f"{what} are too seldom there together, or do not change"
-
-
 def unit_of(role: str, ratio: float, alike: float = ALIKE) -> str:
-    """What `ratio`, of what `role` shows over what it should show, looks like: units mistaken; empty if like nothing.
+    """Name the units that were mistaken if a signal is `ratio` times its right size; empty if none fits.
 
-    The ratio of a signal in km/h that is taken for m/s is 3.6. The nearest is told. alike: how far a ratio may be from
-    it, relative.
+    A signal in km/h that is taken for m/s is 3.6 times too large. alike: tolerance of the ratio, relative. Units that
+    are both not of SI, and powers of ten, must fit better by `RARER`.
     """
-    ours, scales = UNITS[role], {}
-    for unit in known_units(role):
-        scales[unit] = (to_si(unit, role) or (1.0, 0.0))[0]
-    said = {}
-    for read, per_read in scales.items():
-        for meant, per_meant in scales.items():
-            if per_read != per_meant:
-                far = abs(ratio * per_meant / per_read - 1) + (RARER if ours not in (read, meant) else 0.0)
-                said[f": that is {meant} taken for {read}"] = far
+    scales = {unit: (to_si(unit, role) or (1.0, 0.0))[0] for unit in known_units(role)}
+    off = {
+        f": that is {meant} taken for {read}": abs(ratio * scales[meant] / scales[read] - 1)
+        + (RARER if UNITS[role] not in (read, meant) else 0.0)
+        for read in scales
+        for meant in scales
+        if scales[read] != scales[meant]
+    }
     for power in (1000.0, 100.0, 10.0):
-        far = min(abs(ratio / power - 1), abs(ratio * power - 1)) + RARER
-        said[f": a factor of {power:g}, as of a wrong scale in the DBC file"] = far
-    nearest = min(said, key=lambda text: said[text])
-    return nearest if said[nearest] < alike else ""
+        text = f": a factor of {power:g}, as of a wrong scale in the DBC file"
+        off[text] = min(abs(ratio / power - 1), abs(ratio * power - 1)) + RARER
+    nearest = min(off, key=lambda text: off[text])
+    return nearest if off[nearest] < alike else ""
