@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.constants import WH
 from gz_onboard.events import words
 from gz_onboard.model.effect import Effect, Port
@@ -27,6 +28,7 @@ from gz_onboard.reports.style import (
 )
 from gz_onboard.simulation.run import Run
 from gz_onboard.simulation.summary import Variant
+from gz_onboard.simulation.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -120,27 +122,25 @@ Flow = tuple[str, float, str]
 
 
 def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -> Figure:
-    """Energy flows: sources on the left, consumers on the right, each as thick as its energy.
+    """Draw energy flows: sources on the left, consumers on the right, each as thick as its energy.
 
     ledger: J by name, of `effects` and other entries; negative entries gave energy and are on the left with the cells.
     """
     from matplotlib.patches import Rectangle
 
     figure = new_figure(11, 7.2)
-    axis = figure.add_axes((0.02, 0.02, 0.96, 0.86))
+    axis = figure.add_axes((0.02, 0.02, 0.96, 0.86), xlim=(0, 1), ylim=(-0.02, 1.02))
     axis.set_axis_off()
     sources, sinks, total = _flows(ledger, effects)
-    gap = 0.028
-    left, right = 0.17, 0.62
+    gap, left, right = 0.028, 0.17, 0.62
     height = 1.0 - gap * max(len(sinks) - 1, 1)
-    trunk = 0.5 + height / 2
-    y = trunk
+    y = trunk = 0.5 + height / 2
     for name, energy, colour in sources:
         thick = energy / total * height
-        axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
-        text = f"{words(name)}\n{energy / WH:.1f} Wh"
-        axis.text(left - 0.035, y - thick / 2, text, ha="right", va="center", fontsize=10, color=INK)
         y -= thick
+        axis.add_patch(Rectangle((left - 0.025, y), 0.025, thick, color=colour, linewidth=0))
+        text = f"{words(name)}\n{energy / WH:.1f} Wh"
+        axis.text(left - 0.035, y + thick / 2, text, ha="right", va="center", fontsize=10, color=INK)
     y, low = trunk, 1.0
     for name, energy, colour in sinks:
         thick = energy / total * height
@@ -151,8 +151,6 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
         axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=INK)
         y -= thick
         low -= gap
-    axis.set_xlim(0, 1)
-    axis.set_ylim(-0.02, 1.02)
     headline(figure, 0.03, 0.94, title)
     return figure
 
@@ -188,39 +186,37 @@ def _band(axis: Axes, start: tuple[float, float], end: tuple[float, float], thic
     axis.add_patch(PathPatch(Path(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
 
 
-def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Variant], title: str) -> Figure:
+def sweep_lines(sweeps: Sequence[Sweep], variants: Sequence[Variant], title: str) -> Figure:
     """Draw range and consumption against one parameter."""
-    ranges, consumptions = (
-        np.array([getattr(variant, key) for variant in variants], dtype=float)
-        for key in ("range_km", "consumption_wh_km")
-    )
+    shown = ("range_km", "range", "km", BLUE), ("consumption_wh_km", "consumption", "Wh/km", ORANGE)
     rows = [
-        [Panel("range [km]", [Line(ranges, BLUE, "range", 1.6, "o-")], 1.3, BLUE)],
-        [Panel("consumption [Wh/km]", [Line(consumptions, ORANGE, "consumption", 1.6, "o-")], 1.3, ORANGE)],
+        [Panel(f"{name} [{unit}]", [Line(_column(variants, key), colour, name, 1.6, "o-")], 1.3, colour)]
+        for key, name, unit, colour in shown
     ]
-    return chart(rows, np.array(values), name, title)
+    return chart(rows, np.array(sweeps[0].values), sweeps[0].label, title)
 
 
-def sweep_map(
-    names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Variant], title: str
-) -> Figure:
-    """Range and consumption over two parameters, `variants` with the second changing fastest."""
+def sweep_map(sweeps: Sequence[Sweep], variants: Sequence[Variant], title: str) -> Figure:
+    """Draw range and consumption over two parameters, `variants` with the second changing fastest."""
     figure = new_figure(12, 5.4)
+    y, x = sweeps
     for i, (key, text, colours) in enumerate(
         (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))
     ):
         axis = figure.add_axes((0.07 + 0.49 * i, 0.13, 0.36, 0.68))
-        flat = [np.nan if value is None else value for value in (getattr(v, key) for v in variants)]
-        table = np.array(flat, dtype=float).reshape(len(values[0]), len(values[1]))
-        mesh = axis.pcolormesh(values[1], values[0], table, cmap=colours, shading="nearest", alpha=0.85)
+        table = _column(variants, key).reshape(len(y.values), len(x.values))
+        mesh = axis.pcolormesh(x.values, y.values, table, cmap=colours, shading="nearest", alpha=0.85)
         if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
-            lines = axis.contour(values[1], values[0], table, colors=INK, linewidths=0.8)
-            axis.clabel(lines, fontsize=8, fmt="%.4g")
-        bar = figure.colorbar(mesh, ax=axis, fraction=0.05)
-        bar.ax.tick_params(colors=MUTED, labelsize=8, length=0)
-        axis.set_xlabel(names[1], fontsize=9, color=INK)
-        axis.set_ylabel(names[0], fontsize=9, color=INK)
+            axis.clabel(axis.contour(x.values, y.values, table, colors=INK, linewidths=0.8), fontsize=8, fmt="%.4g")
+        figure.colorbar(mesh, ax=axis, fraction=0.05).ax.tick_params(colors=MUTED, labelsize=8, length=0)
+        axis.set_xlabel(x.label, fontsize=9, color=INK)
+        axis.set_ylabel(y.label, fontsize=9, color=INK)
         axis.set_title(text, fontsize=10, color=INK, loc="left")
         axis.tick_params(colors=MUTED, labelsize=8)
     headline(figure, 0.03, 0.94, title)
     return figure
+
+
+def _column(variants: Sequence[Variant], key: str) -> Array:
+    """A value of each variant, not a number where it is unknown; shape (n,)."""
+    return np.array([getattr(variant, key) for variant in variants], dtype=float)

@@ -1,13 +1,12 @@
-"""What ``gz-onboard simulate`` writes: time series, pictures, an HTML page, CAN frames."""
+"""Files of ``gz-onboard simulate``: time series, pictures, an HTML page, CAN frames."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import html
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import writable, writing
@@ -22,9 +21,11 @@ from gz_onboard.simulation.sweep import Sweep
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle
 
-FORMATS = ("mcap", "parquet", "csv")
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = ("parquet", "csv")
 PICTURES = ("", ".ledger", ".measured", ".sweep")
-_TOPIC = "simulation"
 
 
 def write(
@@ -35,12 +36,13 @@ def write(
     summary: SimulationSummary,
     sweeps: Sequence[Sweep],
 ) -> list[str]:
-    """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
-    files: list[Path] = []
+    """Write the time series and the pictures. Returns the names of the files. Raises InputError."""
+    files: list[str] = []
 
     def file(ending: str) -> Path:
-        files.append(output_file(arguments, plan, ending))
-        return files[-1]
+        name = output_file(arguments, plan, ending)
+        files.append(str(name))
+        return name
 
     with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
@@ -48,8 +50,13 @@ def write(
             metadata = {"vehicle": summary.vehicle, "source": summary.what}
             write_series(result, file(f".{arguments.format}"), metadata)
         if not arguments.no_plot:
-            _draw(file, arguments.picture_format, vehicle, plan, result, summary, sweeps)
-    return [str(file) for file in files]
+            title = f"{plan.name}, {summary.kind} · {summary.vehicle}, payload {summary.payload_kg:g} kg"
+            shown = [f"<pre>{html.escape(summary_text(summary))}</pre>"]
+            for ending, figure in _pictures(title, vehicle, plan, result, summary, sweeps).items():
+                save(figure, file(f"{ending}.{arguments.picture_format}"))
+                shown.append(f"<figure>{drawn(figure, ending.lstrip('.'))}</figure>")
+            write_page(file(".html"), title, shown)
+    return files
 
 
 def output_file(arguments: argparse.Namespace, plan: Plan, ending: str) -> Path:
@@ -59,7 +66,7 @@ def output_file(arguments: argparse.Namespace, plan: Plan, ending: str) -> Path:
 
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
-    """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
+    """Write the ride's frames. Returns the name of the file. Raises InputError."""
     dropouts = Dropouts() if arguments.frame_loss is None else Dropouts(frames=arguments.frame_loss)
     sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, dropouts=dropouts)
     with writing(arguments.frames):
@@ -68,38 +75,22 @@ def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, s
     return str(arguments.frames)
 
 
-def _draw(
-    file: Callable[[str], Path],
-    picture_format: str,
-    vehicle: Vehicle,
-    plan: Plan,
-    result: Run,
-    summary: SimulationSummary,
-    sweeps: Sequence[Sweep],
-) -> None:
+def _pictures(
+    title: str, vehicle: Vehicle, plan: Plan, result: Run, summary: SimulationSummary, sweeps: Sequence[Sweep]
+) -> dict[str, Figure]:
+    """The figures by the ending of their files."""
     from gz_onboard.simulation import figures
 
-    title = f"{plan.name}, {summary.kind} · {summary.vehicle}, payload {summary.payload_kg:g} kg"
     energy = figures.sankey(result.ledger, vehicle.model.effects, f"{title}: energy")
-    pictures = [("", figures.overview(result, title)), (".ledger", energy)]
+    pictures = {"": figures.overview(result, title), ".ledger": energy}
     if plan.recorded:
-        columns = measured_columns(plan.recorded, result)
-        pictures.append((".measured", figures.comparison(result, columns, title)))
-    variants = summary.sweep or []
-    swept = f"{plan.name}, {summary.kind} · {summary.vehicle}"
-    if all(sweep.name != "payload_mass" for sweep in sweeps):
-        swept += f", payload {summary.payload_kg:g} kg"
-    if len(sweeps) == 1:
-        pictures.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, swept)))
-    elif sweeps:
-        one, two = sweeps
-        names, values = (one.label, two.label), (one.values, two.values)
-        pictures.append((".sweep", figures.sweep_map(names, values, variants, swept)))
-    for ending, figure in pictures:
-        save(figure, file(f"{ending}.{picture_format}"))
-    text = f"<pre>{html.escape(summary_text(summary))}</pre>"
-    shown = [f"<figure>{drawn(figure, ending.lstrip('.'))}</figure>" for ending, figure in pictures]
-    write_page(file(".html"), title, [text, *shown])
+        pictures[".measured"] = figures.comparison(result, measured_columns(plan.recorded, result), title)
+    if sweeps:
+        if any(sweep.name == "payload_mass" for sweep in sweeps):
+            title = title.partition(", payload")[0]
+        draw = figures.sweep_lines if len(sweeps) == 1 else figures.sweep_map
+        pictures[".sweep"] = draw(sweeps, summary.sweep or [], title)
+    return pictures
 
 
 def series_table(result: Run) -> dict[str, Array]:
@@ -108,34 +99,14 @@ def series_table(result: Run) -> dict[str, Array]:
 
 
 def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
-    """The time series as MCAP, Parquet or CSV by the file's name; columns as ``name[unit]``, not a number as null."""
-    table = series_table(result)
-    names = list(table)
-    if file.suffix == ".parquet":
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+    """Write the time series as Parquet or CSV by the file's name; not a number becomes null."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet
 
-        columns = [pa.array(column, from_pandas=True) for column in table.values()]
-        arrow = pa.table(columns, names=names)
-        named = {key: writable(text) for key, text in metadata.items()}
-        with file.open("wb") as binary:  # pyarrow opens no name that is not UTF-8
-            pq.write_table(arrow.replace_schema_metadata(named), binary)
-        return
-    rows = zip(*(column.tolist() for column in table.values()), strict=True)
-    if file.suffix == ".csv":
-        with file.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(names)
-            writer.writerows(["" if math.isnan(value) else f"{value:.9g}" for value in row] for row in rows)
-        return
-    from gz_onboard.can.logfile import LogFile
-
-    log = LogFile(file.open("wb"), 0, metadata)
-    try:
-        properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in COLUMNS.items()}
-        log.channel(_TOPIC, {"title": "Simulation", "type": "object", "properties": properties})
-        for row in rows:
-            log.sample(_TOPIC, round(row[0] * 1e9), dict(zip(COLUMNS, row, strict=True)))
-        log.close()
-    finally:
-        log.abandon()
+    table = pa.table({name: pa.array(column, from_pandas=True) for name, column in series_table(result).items()})
+    with file.open("wb") as binary:  # pyarrow opens no name that is not UTF-8
+        if file.suffix == ".csv":
+            csv.write_csv(table, binary, csv.WriteOptions(quoting_style="none"))
+        else:
+            named = {key: writable(text) for key, text in metadata.items()}
+            parquet.write_table(table.replace_schema_metadata(named), binary)

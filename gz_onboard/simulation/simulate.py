@@ -92,7 +92,7 @@ def _number(
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard simulate``."""
     require("matplotlib", not arguments.no_plot)
-    require("pyarrow", arguments.format == "parquet" and not arguments.no_series)
+    require("pyarrow", not arguments.no_series)
     vehicle, payload_from = vehicle_on(arguments.what, arguments.vehicle, arguments.payload)
     options = SimulationOptions(**{field.name: getattr(arguments, field.name) for field in fields(SimulationOptions)})
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]

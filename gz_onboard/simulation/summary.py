@@ -25,6 +25,7 @@ _RANGE_BY = {
     "energy": "ridden, and energy left at the end over the consumption",
     None: "not known",
 }
+_WHY_SLOW = {True: "beyond the vehicle", False: "the rider's lag"}
 _SHOWN = 5  # shortfalls
 _LEAST = 0.005  # Wh: less of the ledger is not shown
 _FARTHER = 0.05  # km: less would not show
@@ -228,14 +229,13 @@ def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
 
 def summary_text(summary: SimulationSummary) -> str:
     """A summary for a terminal."""
-    ledger = sorted(summary.ledger_wh.items(), key=lambda item: -item[1])
-    ledger = [(name, energy) for name, energy in ledger if abs(energy) >= _LEAST]
-    gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
+    often = f"{summary.repetitions:.3g}"
+    repeated = "" if summary.kind != "cycle" else ", once" if often == "1" else f", {often} times"
     rows = [
         (
             summary.kind,
             f"{clock(summary.duration_s)}, {summary.distance_km:.2f} km, "
-            f"at most {summary.speed_max_km_h:.0f} km/h{_repeated(summary)}",
+            f"at most {summary.speed_max_km_h:.0f} km/h{repeated}",
         ),
         (
             "energy",
@@ -244,115 +244,100 @@ def summary_text(summary: SimulationSummary) -> str:
         ),
         ("state of charge", f"{100 * summary.soc_start:.1f} → {100 * summary.soc_end:.1f} %"),
         ("range", f"{number(summary.range_km, '.1f', 'km')} from the start ({_RANGE_BY[summary.range_by]})"),
-        *_beyond_rows(summary),
-        *_shortfall_rows(summary),
-        *(
-            (
-                "where it went" if not i else "",
-                f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %",
-            )
-            for i, (name, energy) in enumerate(ledger)
-        ),
-        *_measured_rows(summary),
-        *_turning_rows(summary),
-        ("energy balance", f"closes to {plain(100 * abs(summary.closure))} % of all that flowed"),
-        ("computed in", f"{summary.wall_s:.2f} s, step {1000 * summary.step_s:g} ms"),
+        *_named("beyond the battery", _beyond_texts(summary)),
+        *_named("shortfall", _shortfall_texts(summary)),
+        *_named("where it went", _ledger_texts(summary)),
+        *_measured_rows(summary.measured),
     ]
+    if seconds := summary.turning_beyond_s:
+        edge = f"{seconds:.1f} s in bends harder than the {summary.chassis} model goes: taken at its edge"
+        rows.append(("turning", edge))
+    rows.append(("energy balance", f"closes to {plain(100 * abs(summary.closure))} % of all that flowed"))
+    rows.append(("computed in", f"{summary.wall_s:.2f} s, step {1000 * summary.step_s:g} ms"))
     rows += [("written", ", ".join(summary.files))] if summary.files else []
     head = f"{summary.what}, {summary.vehicle}, payload {summary.payload_kg:g} kg (by {summary.payload_from})"
     return "\n".join([text_rows(head, rows), *(["", variants_text(summary.sweep)] if summary.sweep else [])])
 
 
-def _repeated(summary: SimulationSummary) -> str:
-    """How often a cycle was ridden; nothing of a route or a recorded ride, which have one way."""
-    often = f"{summary.repetitions:.3g}"
-    return "" if summary.kind != "cycle" else ", once" if often == "1" else f", {often} times"
+def _named(name: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Rows of which the first has a name."""
+    return [(name if not i else "", text) for i, text in enumerate(texts)]
 
 
-def _beyond_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
+def _beyond_texts(summary: SimulationSummary) -> list[str]:
     """Demands beyond the battery, and why two ranges differ."""
-    rows = []
+    texts = []
     for b in summary.beyond_battery:
         place = f"{b.time_s:.0f} s, {b.distance_km:.2f} km"
         if b.charge:
             text = f"no charge is left from {place}: the ride goes on {b.duration_s:.0f} s that no pack can give"
-            rows.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
+            texts.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
             continue
         when = f"from {place}, for {b.duration_s:.0f} s in all" if b.duration_s >= 1.0 else f"at {place}"
-        rows.append(
+        texts.append(
             f"{when}, {b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at "
             f"{100 * b.soc:.0f} % of charge: its cut-off is {b.cutoff_v:.1f} V"
         )
-    energy, soc = summary.range_by_energy_km, summary.soc_end
+    energy = summary.range_by_energy_km
     if summary.range_by == "cut-off" and energy is not None:
         more = energy - summary.distance_km >= _FARTHER
         would = f"its energy would do for {energy:.1f} km" if more else "it goes farther only"
-        rows.append(
-            f"so it ends with {100 * soc:.0f} % left; {would} at a lower current "
+        texts.append(
+            f"so it ends with {100 * summary.soc_end:.0f} % left; {would} at a lower current "
             "(motor_current_limit, [controller] of the vehicle file)"
         )
-    elif rows and summary.range_by == "energy":
-        rows.append("the range is that of the energy: a vehicle that gives up there, as --until-empty, ends there")
-    return [("beyond the battery" if not i else "", row) for i, row in enumerate(rows)]
+    elif texts and summary.range_by == "energy":
+        texts.append("the range is that of the energy: a vehicle that gives up there, as --until-empty, ends there")
+    return texts
 
 
-def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
+def _shortfall_texts(summary: SimulationSummary) -> list[str]:
     found = summary.shortfalls
     if not found:
         return []
     stretches = f"{len(found)} stretches; the worst" if len(found) > 1 else "one stretch"
-    rows = [("shortfall", f"{summary.shortfall_s:.0f} s slower than wanted, in {stretches}:")]
-    for s in found[:_SHOWN]:
-        why = "beyond the vehicle" if s.beyond_vehicle else "the rider's lag"
-        place = f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s"
-        rows.append(("", f"{place}: {s.missing_km_h:.1f} km/h below {s.wanted_km_h:.0f} km/h: {why}"))
-    return rows
+    return [
+        f"{summary.shortfall_s:.0f} s slower than wanted, in {stretches}:",
+        *(
+            f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s: {s.missing_km_h:.1f} km/h below "
+            f"{s.wanted_km_h:.0f} km/h: {_WHY_SLOW[s.beyond_vehicle]}"
+            for s in found[:_SHOWN]
+        ),
+    ]
 
 
-def _turning_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
-    seconds = summary.turning_beyond_s
-    if not seconds:
-        return []
-    return [("turning", f"{seconds:.1f} s in bends harder than the {summary.chassis} model goes: taken at its edge")]
+def _ledger_texts(summary: SimulationSummary) -> list[str]:
+    ledger = sorted(summary.ledger_wh.items(), key=lambda item: -item[1])
+    gross = sum(energy for _, energy in ledger if energy >= _LEAST) or 1.0
+    return [
+        f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %"
+        for name, energy in ledger
+        if abs(energy) >= _LEAST
+    ]
 
 
-def _measured_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
-    m = summary.measured
+def _measured_rows(m: MeasuredEntry | None) -> list[tuple[str, str]]:
     if not m:
         return []
+    energy, consumption = number(m.energy_wh, ".1f", "Wh"), number(m.consumption_wh_km, ".2f", "Wh/km")
+    differences = (
+        number(m.rms_speed_km_h, ".1f", "km/h"),
+        number(m.rms_pack_voltage_v, ".2f", "V"),
+        number(m.rms_pack_current_a, ".1f", "A"),
+        number(m.rms_motor_torque_nm, ".1f", "N·m"),
+    )
     return [
-        (
-            "measured",
-            f"{m.distance_km:.2f} km, {number(m.energy_wh, '.1f', 'Wh')}, "
-            f"{number(m.consumption_wh_km, '.2f', 'Wh/km')}",
-        ),
-        (
-            "simulated less",
-            "RMS "
-            + ", ".join(
-                (
-                    number(m.rms_speed_km_h, ".1f", "km/h"),
-                    number(m.rms_pack_voltage_v, ".2f", "V"),
-                    number(m.rms_pack_current_a, ".1f", "A"),
-                    number(m.rms_motor_torque_nm, ".1f", "N·m"),
-                )
-            ),
-        ),
+        ("measured", f"{m.distance_km:.2f} km, {energy}, {consumption}"),
+        ("simulated less", f"RMS {', '.join(differences)}"),
     ]
 
 
 def variants_text(sweep: Sequence[Variant]) -> str:
     """A table of the variants, for a terminal."""
-    names = list(sweep[0].values)
-    heads = [*names, "Wh/km", "range km", "shortfall s"]
-    width = [max(len(head), 10) for head in heads]
-    lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
-    for variant in sweep:
-        cells = [f"{value:g}" for value in variant.values.values()]
-        cells += [
-            number(variant.consumption_wh_km, ".2f"),
-            number(variant.range_km, ".1f"),
-            f"{variant.shortfall_s:.0f}",
-        ]
-        lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
+    heads = [*sweep[0].values, "Wh/km", "range km", "shortfall s"]
+    lines = ["  ".join(f"{head:>10}" for head in heads)]
+    for v in sweep:
+        results = number(v.consumption_wh_km, ".2f"), number(v.range_km, ".1f"), f"{v.shortfall_s:.0f}"
+        cells = [*(f"{value:g}" for value in v.values.values()), *results]
+        lines.append("  ".join(f"{cell:>{max(len(head), 10)}}" for cell, head in zip(cells, heads, strict=True)))
     return "\n".join(lines)
