@@ -16,7 +16,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.constants import MILD
 from gz_onboard.model.effect import MOVING
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.series import all_quantities, over
+from gz_onboard.model.series import all_quantities, over
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:

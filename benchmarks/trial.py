@@ -33,7 +33,7 @@ from scipy.stats import binomtest
 
 from gz_onboard.discovery.baseline import baseline
 from gz_onboard.discovery.run import discover
-from gz_onboard.offline.processes import worker_pool
+from gz_onboard.processes import worker_pool
 from gz_onboard.recording.recording import Recording
 from gz_onboard.reports.results import to_json
 from gz_onboard.vehicle import Vehicle, read_vehicle

@@ -35,9 +35,9 @@ COMMANDS = {
     ),
     "calibrate": ("gz_onboard.calibration.command", "determine a vehicle's parameters from measurements"),
     "discover": ("gz_onboard.discovery.command", "find the model's errors on rides, name the cause, extend the model"),
-    "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or its contents to Parquet, CSV, ..."),
+    "export": ("gz_onboard.export.command", "convert a log to candump, BLF, ASC, or its contents to Parquet, CSV, ..."),
     "vehicle": ("gz_onboard.vehicle_check.command", "begin a vehicle file, or check it against the vehicle's logs"),
-    "report": ("gz_onboard.lab.report", "show recorded rides as one self-contained HTML page, also for phones"),
+    "report": ("gz_onboard.estimation.report", "show recorded rides as one self-contained HTML page, also for phones"),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.offline.write_logs import write_frames_as
+from gz_onboard.export.logs import write_frames_as
 from gz_onboard.recording.logs import read_frames
 from tests.support import LOGS
 

@@ -15,10 +15,10 @@ from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.can.layout import crc8_sae_j1850
 from gz_onboard.can.logfile import LogFile
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.export.logs import write_frames_as
 from gz_onboard.model.battery import Battery
 from gz_onboard.model.effect import Effect, Port
 from gz_onboard.model.parameters import Parameters, Value
-from gz_onboard.offline.write_logs import write_frames_as
 from gz_onboard.pipeline import TICK_NS, Pipeline
 from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns

@@ -13,7 +13,7 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import cli
-from gz_onboard.offline.table import Columns
+from gz_onboard.reports.tables import Columns
 from tests.support import LOGS, ROOT
 
 COASTDOWN = LOGS / "coastdown.blf"

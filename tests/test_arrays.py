@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.offline.arrays import bends, block_means, held_at, held_integral, running_mean, stretches
+from gz_onboard.arrays import bends, block_means, held_at, held_integral, running_mean, stretches
 
 TIME, VALUES = np.array([0.0, 1.0, 3.0]), np.array([2.0, 5.0, 7.0])
 

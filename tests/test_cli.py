@@ -216,7 +216,7 @@ def test_a_disk_that_fails_is_no_bad_input(
         out.write_text("half")
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr("gz_onboard.lab.export.write_frames_as", failing)
+    monkeypatch.setattr("gz_onboard.export.command.write_frames_as", failing)
     assert status("export", RIDE, str(tmp_path / "x.log")) == 1
     assert f"x.log: cannot be written: {os.strerror(number)}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

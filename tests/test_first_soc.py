@@ -10,7 +10,7 @@ from gz_onboard.discovery.mixed_model import initial
 from gz_onboard.discovery.residuals import start_soc
 from gz_onboard.events import Group
 from gz_onboard.model.effect import Port
-from gz_onboard.offline.series import all_quantities, first_soc, total
+from gz_onboard.model.series import all_quantities, first_soc, total
 from gz_onboard.recording.recording import Recording
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle

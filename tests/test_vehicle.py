@@ -11,7 +11,7 @@ import pytest
 import gz_onboard
 from gz_onboard.errors import InputError
 from gz_onboard.model.effect import load_effect
-from gz_onboard.offline.correlations import correlations
+from gz_onboard.priors import correlations
 from gz_onboard.vehicle import OWN, find_vehicle, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")

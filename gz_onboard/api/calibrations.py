@@ -14,7 +14,7 @@ from gz_onboard.calibration import report
 from gz_onboard.calibration.result import Result
 from gz_onboard.calibration.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.errors import InputError, not_an_input, writing
-from gz_onboard.offline.table import Columns, Tabular, columns_of
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.arguments import checked
 from gz_onboard.errors import brief
-from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
+from gz_onboard.recording.logs import distinct_logs
 from gz_onboard.reports.results import descriptions
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.check import Checked, RoleSeen, check_log, check_text
 from gz_onboard.vehicle_check.command import roles_text

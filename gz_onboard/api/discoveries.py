@@ -20,9 +20,9 @@ from gz_onboard.discovery.mixed_model import MixedModel
 from gz_onboard.discovery.report import summary, write_report
 from gz_onboard.discovery.run import discover as find
 from gz_onboard.errors import InputError, brief, not_an_input, writing
-from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.reports.results import distinct_names
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 from gz_onboard.vehicle import Vehicle
 
 _CAUSE = ("name", "parameter", "value", "unit", "ci95_low", "ci95_high", "change", "energy_share", "varies")

@@ -17,11 +17,11 @@ from gz_onboard.estimation import summary
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, RideRun, open_estimate, run_ride, state_for
 from gz_onboard.estimation.saved_state import held, text_of
 from gz_onboard.estimation.summary import RideSummary, summary_of, summary_text
-from gz_onboard.lab import export_tables
+from gz_onboard.export.contents import ExportSource
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log
-from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of, table_columns
 from gz_onboard.progress import Progress
 from gz_onboard.recording.tables import SignalTable
+from gz_onboard.reports.tables import Columns, Tabular, array_of, columns_of, table_columns
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle
 
@@ -112,7 +112,8 @@ def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
 @checked
 def read_estimates(log: PathLike) -> LoggedEstimates:
     """The estimates that the daemon or ``gz-onboard estimate`` wrote into an MCAP log. InputError if it has none."""
-    source = export_tables.ExportSource(Path(log))
-    rows = export_tables.estimate_rows(source)
-    columns = export_tables.topic_columns(source.log, ESTIMATE_TOPIC)
-    return LoggedEstimates(columns, [time_ns for time_ns, _ in rows], [values for _, values in rows])
+    source = ExportSource(Path(log))
+    rows = source.estimates()
+    return LoggedEstimates(
+        source.columns_of(ESTIMATE_TOPIC), [time_ns for time_ns, _ in rows], [values for _, values in rows]
+    )

@@ -12,12 +12,11 @@ from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.arguments import checked, within
 from gz_onboard.errors import InputError, brief
 from gz_onboard.events import Frame
-from gz_onboard.lab import export_tables
-from gz_onboard.offline import write_tables
-from gz_onboard.offline.table import Columns, Tabular, array_of
+from gz_onboard.export.contents import FRAME, ExportSource, frame_columns
 from gz_onboard.options import LONGEST_LOG
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.reports.tables import Columns, Tabular, array_of
 
 _KINDS = {int: np.int64, bool: bool, str: object}
 
@@ -33,8 +32,8 @@ class LoggedFrames(Tabular):
 
     def to_table(self) -> Columns:
         """A row for each frame, with the columns that ``gz-onboard export --frames`` writes."""
-        columns = write_tables.frame_columns(FrameColumns.of(self.frames))
-        arrays = {name: np.array(column, _KINDS[write_tables.FRAME[name]]) for name, column in columns.items()}
+        columns = frame_columns(FrameColumns.of(self.frames))
+        arrays = {name: np.array(column, _KINDS[FRAME[name]]) for name, column in columns.items()}
         return {"time": _times([frame[0] for frame in self.frames]), **arrays}
 
 
@@ -86,8 +85,7 @@ class LoggedSignals(Tabular):
 def read_frames(log: PathLike, *, start: float = 0.0, end: float | None = None) -> LoggedFrames:
     """The frames in a log. start, end: only those in this part of it [s from its beginning]. Raises InputError."""
     source = _source(log, start, end)
-    _, frames = source.frames()
-    return LoggedFrames(frames.tuples(), source.damages)
+    return LoggedFrames(source.frames().tuples(), source.damages)
 
 
 @checked
@@ -109,10 +107,10 @@ def read_signals(
         raise InputError("dbc: a vehicle has DBC files of its own; give one of the two")
     source = _source(log, start, end, columns)
     known = None if vehicle is None else vehicle_of(vehicle)
-    found = export_tables.signals_of(source, [Path(file) for file in dbc], known)
+    found = source.signals([Path(file) for file in dbc], known)
     messages = {
         name: LoggedMessage(rows.times, {column: array_of(values) for column, values in rows.columns.items()})
-        for name, rows in write_tables.by_message(found.decoded).items()
+        for name, rows in found.messages.items()
     }
     if (decoder := found.decoder) is None:
         return LoggedSignals(messages, source.damages)
@@ -120,13 +118,11 @@ def read_signals(
     return LoggedSignals(messages, source.damages, decoder.unknown, decoder.undecodable, conflicts)
 
 
-def _source(
-    log: PathLike, start: float, end: float | None, columns: Sequence[str] | None = None
-) -> export_tables.ExportSource:
+def _source(log: PathLike, start: float, end: float | None, columns: Sequence[str] | None = None) -> ExportSource:
     within("start", start, {"start": (0.0, LONGEST_LOG, "s")})
     if end is not None and not end > start:
         raise InputError(f"end {end:g} s: must be after start {start:g} s")
-    return export_tables.ExportSource(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
+    return ExportSource(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
 
 
 def _times(times: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.datetime64]]:

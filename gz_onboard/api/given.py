@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from gz_onboard.arguments import checked, within
-from gz_onboard.offline.correlations import correlations
 from gz_onboard.options import MOST_PAYLOAD
+from gz_onboard.priors import correlations
 from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.recording.tables import SignalTable, table_of
 from gz_onboard.vehicle import Vehicle

@@ -11,7 +11,7 @@ from gz_onboard.arguments import checked
 from gz_onboard.daemon import learned as command
 from gz_onboard.errors import brief
 from gz_onboard.estimator.pack_age import LearnedFactor
-from gz_onboard.offline.table import Columns, Tabular, columns_of
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 from gz_onboard.state import state_file
 
 _COLUMNS = ("part", "name", "factor", "sd", "percent_learned")

@@ -10,11 +10,11 @@ from pathlib import Path
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.arguments import checked
 from gz_onboard.errors import InputError, not_an_input, writing
+from gz_onboard.estimation.report import ReportedRide, check_page, page_of, report_of, section_of
 from gz_onboard.estimation.summary import summary_text
-from gz_onboard.lab.report import ReportedRide, check_page, page_of, report_of, section_of
-from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
+from gz_onboard.recording.logs import distinct_logs
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
 from gz_onboard.arguments import checked
 from gz_onboard.errors import InputError
-from gz_onboard.offline.table import Columns, Tabular, array_of
 from gz_onboard.progress import Progress
+from gz_onboard.reports.tables import Columns, Tabular, array_of
 from gz_onboard.simulation.output import series_table
 from gz_onboard.simulation.plan import SimulationOptions, find_plan, vehicle_on
 from gz_onboard.simulation.run import Run

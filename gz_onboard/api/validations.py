@@ -10,9 +10,9 @@ from pathlib import Path
 from gz_onboard.api.given import PathLike, VehicleLike, file_of
 from gz_onboard.arguments import checked
 from gz_onboard.errors import InputError
-from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
 from gz_onboard.recording.logs import logs_among
+from gz_onboard.reports.tables import Columns, Tabular, columns_of
 from gz_onboard.simulation.plan import vehicle_on
 from gz_onboard.validation.comparison import ValidatedRide
 from gz_onboard.validation.ride import compare_ride

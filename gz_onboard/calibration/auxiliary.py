@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, held_at
 from gz_onboard.calibration.fit import score
 from gz_onboard.calibration.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
-from gz_onboard.offline.arrays import held_at
-from gz_onboard.offline.sensors import speed_role
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import speed_role
 from gz_onboard.vehicle import Vehicle
 
 NEEDED = ("auxiliary_current", "pack_voltage")

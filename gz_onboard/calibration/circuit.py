@@ -22,12 +22,11 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, bends
 from gz_onboard.calibration.cell import CellTest
 from gz_onboard.constants import KELVIN
 from gz_onboard.model.effects import charge_transfer
-from gz_onboard.offline.arrays import bends
-from gz_onboard.offline.series import bilinear_over, extended_over, relaxation, terminal_voltage
+from gz_onboard.model.series import bilinear_over, extended_over, relaxation, terminal_voltage
 
 # The number of reactions stays as declared: pulses alone would take more, and held-out road profiles then err more.
 *FOUND, REACTIONS = charge_transfer.PARAMETERS

@@ -23,7 +23,7 @@ from gz_onboard.calibration.fit import Solution, linear
 from gz_onboard.calibration.road_load import NAMES, RoadLoad
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.correlations import correlations
+from gz_onboard.priors import correlations
 from gz_onboard.vehicle import Vehicle
 
 SPEED_PRIOR = 1e-3  # s/m: no tyre's rolling resistance grows faster (SAE J2452)

@@ -11,8 +11,8 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.offline.sensors import speed_role, true_columns
 from gz_onboard.recording.recording import Recording, read_facts
+from gz_onboard.recording.sensors import speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.calibration.fit import Solution, nonlinear, score
 from gz_onboard.calibration.manifest import AIRFLOWS
 from gz_onboard.calibration.result import Curve, Panel, PlotLine, Result
@@ -21,14 +21,13 @@ from gz_onboard.calibration.table import Measurements
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.errors import InputError
 from gz_onboard.model.battery import reversible_heat
+from gz_onboard.model.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import STOOD, stepping
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.arrays import held_integral
-from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
-from gz_onboard.offline.sensors import road_speed, true_columns
-from gz_onboard.offline.series import advanced, all_quantities, first_soc, idle_loss, total
+from gz_onboard.model.series import advanced, all_quantities, first_soc, idle_loss, total
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
 

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.calibration.manifest import AIRFLOWS
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.errors import InputError
+from gz_onboard.model.cooling import PERIOD
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import STOOD, stepping
-from gz_onboard.offline.arrays import held_integral
-from gz_onboard.offline.cooling import PERIOD
-from gz_onboard.offline.sensors import road_speed, true_columns
-from gz_onboard.offline.series import advanced, all_quantities, first_soc, idle_loss, total
+from gz_onboard.model.series import advanced, all_quantities, first_soc, idle_loss, total
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
 FIRST = 1.0  # s: whose mean voltage and current tell the state of charge at the start, before the load has grown

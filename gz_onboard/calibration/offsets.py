@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.calibration.auxiliary import CURRENT_SD, PACK, standing
 from gz_onboard.calibration.fit import as_groups, every_second, line, score
 from gz_onboard.calibration.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.errors import InputError
-from gz_onboard.lab.sizes import sizes_of
-from gz_onboard.offline.arrays import block_means
+from gz_onboard.priors import sizes_of
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot
 
 from gz_onboard.calibration.result import Result
-from gz_onboard.lab.overrun import FAR, overrun, stop_at
+from gz_onboard.priors import FAR, overrun, stop_at
 from gz_onboard.vehicle import Vehicle
 
 

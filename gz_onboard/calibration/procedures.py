@@ -16,8 +16,8 @@ from gz_onboard.calibration.manifest import Option, Slot
 from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
-from gz_onboard.offline.sensors import true_columns
 from gz_onboard.recording.recording import Recording, ride_name
+from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 

@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix, diags, hstack
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, bends
 from gz_onboard.calibration.cell import FLAT, TESTER, CellTest, cell_test, increasing
 from gz_onboard.calibration.circuit import (
     FOUND,
@@ -51,8 +51,7 @@ from gz_onboard.constants import BENCH_TEMPERATURE, HOUR, KELVIN
 from gz_onboard.errors import InputError
 from gz_onboard.model.effects import charge_transfer as transfer_effect
 from gz_onboard.model.effects import slow_relaxation as slow_effect
-from gz_onboard.offline.arrays import bends
-from gz_onboard.offline.series import extended_over
+from gz_onboard.model.series import extended_over
 
 CHARGE_TRANSFER, SLOW_RELAXATION = (e.__name__.rpartition(".")[2] for e in (transfer_effect, slow_effect))
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])

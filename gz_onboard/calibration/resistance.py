@@ -10,20 +10,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.calibration.fit import as_groups, every_second, line, linear, score
 from gz_onboard.calibration.offsets import read_pair, window_means
 from gz_onboard.calibration.result import Found, Result, compared
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
-from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.model.battery import discharged
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import standing_load
-from gz_onboard.offline.arrays import held_integral
-from gz_onboard.offline.sensors import true_columns
-from gz_onboard.offline.series import first_soc
+from gz_onboard.model.series import first_soc
+from gz_onboard.priors import sizes_of
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s

@@ -19,8 +19,8 @@ from gz_onboard.calibration.coastdown_run import Coast
 from gz_onboard.model.effect import ROAD_LOAD, Port
 from gz_onboard.model.effects.inertia import rotating_mass
 from gz_onboard.model.model import Bound, air_density
-from gz_onboard.offline.sensors import road_speed
-from gz_onboard.offline.series import all_quantities, total
+from gz_onboard.model.series import all_quantities, total
+from gz_onboard.recording.sensors import road_speed
 from gz_onboard.vehicle import Vehicle
 
 STRONGEST = 8.0  # m/s: a wind in which nobody coasts down

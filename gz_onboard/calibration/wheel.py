@@ -12,8 +12,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.result import Fit, Found, LackingError, Panel, PlotLine, Result
-from gz_onboard.offline.sensors import true_columns
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 SLOWEST = 5.0  # m/s: below, a receiver's speed is poor

@@ -29,8 +29,8 @@ from gz_onboard.discovery.mixed_model import (
 from gz_onboard.discovery.parameters import GIVEN_SCATTER, LOG_SCALED, VEHICLE
 from gz_onboard.discovery.search import with_own_start
 from gz_onboard.errors import InputError
-from gz_onboard.lab.overrun import ENTERED, FAR, overrun, stop_at
 from gz_onboard.model.parameters import Parameters, Value, declared_parameters
+from gz_onboard.priors import ENTERED, FAR, overrun, stop_at
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 

@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import COARSE, STEP, Ride
 from gz_onboard.discovery.residuals import System, Values
 from gz_onboard.model.effect import ROAD_LOAD, Effect, Port
-from gz_onboard.offline.arrays import block_means
 
 ROLLING = 2.0  # m/s: above it the wheel rolls freely
 

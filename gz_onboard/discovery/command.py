@@ -17,8 +17,8 @@ from gz_onboard.discovery.parameters import candidates
 from gz_onboard.discovery.report import listing, summary
 from gz_onboard.discovery.run import discover, known_rides
 from gz_onboard.errors import InputError, near_file, not_an_input, writing
-from gz_onboard.offline.processes import Task, over_rides
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
+from gz_onboard.processes import Task, over_rides
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.logs import log_suffix, logs_among
 from gz_onboard.recording.recording import Recording, read_recording, ride_name

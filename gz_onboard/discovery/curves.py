@@ -11,7 +11,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.grid import STEP, Ride, smooth
 from gz_onboard.discovery.mixed_model import HealthyCurve, LinearChannel, LinearRide, MixedModel, Population, Statistics
-from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
+from gz_onboard.priors import USUAL_SIZES, Sizes
 
 CONSTANT = "constant"  # the quantity of a residual that is the same everywhere
 KNOTS: dict[str, tuple[tuple[float, ...], str, str]] = {  # knots in a vehicle of size 1, unit, size they grow with

@@ -12,18 +12,17 @@ from functools import cached_property
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, block_means, running_mean
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
-from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.model.effect import MOVING, Port
 from gz_onboard.model.model import air_density
 from gz_onboard.model.sensors import grade_shown, true_current, true_voltage
-from gz_onboard.offline.arrays import block_means, running_mean
-from gz_onboard.offline.sensors import Vibration, road_speed, speed_role
-from gz_onboard.offline.series import total
+from gz_onboard.model.series import total
+from gz_onboard.priors import sizes_of
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import Vibration, road_speed, speed_role
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s

@@ -33,12 +33,11 @@ from gz_onboard.discovery.parameters import (
     stepped,
 )
 from gz_onboard.discovery.residuals import System, counted_soc, start_soc
-from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.model.effect import Effect, Port
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.correlations import correlations
-from gz_onboard.offline.processes import worker_pool
-from gz_onboard.offline.series import relaxation
+from gz_onboard.model.series import relaxation
+from gz_onboard.priors import correlations, sizes_of
+from gz_onboard.processes import worker_pool
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.sizes import nearest_step, sizes_of
 from gz_onboard.model.effect import BASE_EFFECTS, Effect, Parameter, Port, effects_in, load_effect, package_effects
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.traits import traits
+from gz_onboard.model.traits import traits
+from gz_onboard.priors import nearest_step, sizes_of
 from gz_onboard.vehicle import Vehicle
 
 

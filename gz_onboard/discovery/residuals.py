@@ -13,20 +13,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.discovery.grid import COARSE, STEP, Ride
 from gz_onboard.errors import InputError
-from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 from gz_onboard.model.battery import Battery, discharged
+from gz_onboard.model.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.model.effect import MOVING, ROAD_LOAD, Effect, Port
 from gz_onboard.model.effects.inertia import rotating_mass
 from gz_onboard.model.model import Bound, drag_torque, standing_load
 from gz_onboard.model.riding import PriorRiding
 from gz_onboard.model.sensors import grade_shown, true_current, true_voltage
-from gz_onboard.offline.arrays import block_means, running_mean
-from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
-from gz_onboard.offline.series import (
+from gz_onboard.model.series import (
     curve_over,
     first_soc,
     heat,
@@ -37,7 +35,8 @@ from gz_onboard.offline.series import (
     series,
     terminal_voltage,
 )
-from gz_onboard.offline.traits import traits
+from gz_onboard.model.traits import traits
+from gz_onboard.priors import USUAL_SIZES, Sizes
 
 Values = Mapping[str, float]
 """Parameters and nuisances by name."""

@@ -35,13 +35,12 @@ from gz_onboard.estimation.summary import (
 )
 from gz_onboard.imports import require
 from gz_onboard.log_rows import ESTIMATE_TOPIC
-from gz_onboard.offline.digest import digest_of
-from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import Pipeline, dbc_texts, lacking
+from gz_onboard.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.frames import SignalColumns
-from gz_onboard.recording.logs import ESTIMATED, read_metadata, read_samples
+from gz_onboard.recording.logs import ESTIMATED, digest_of, read_metadata, read_samples
 from gz_onboard.recording.recording import of_ride
 from gz_onboard.reports.charts import overview
 from gz_onboard.reports.results import Failure, clock, number, write_json

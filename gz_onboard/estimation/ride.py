@@ -21,8 +21,8 @@ from gz_onboard.estimator.consumption import CONSUMPTION
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import STATUS_TOPIC, Log, reason_names
-from gz_onboard.offline.processes import Task
 from gz_onboard.pipeline import Pipeline, range_publisher
+from gz_onboard.processes import Task
 from gz_onboard.progress import Progress
 from gz_onboard.recording.decode import decode_columns, feed
 from gz_onboard.recording.frames import FrameColumns, SignalColumns

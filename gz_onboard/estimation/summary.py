@@ -14,9 +14,9 @@ from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.estimation.ride import RideRun
 from gz_onboard.events import WINDOW, Estimate, Explanation, Reason, RouteState, State, words
 from gz_onboard.imports import require
-from gz_onboard.offline.write_tables import write_table
 from gz_onboard.pipeline import lacking
 from gz_onboard.reports.results import Failure, clock, descriptions, leap_text, number, text_rows, times, to_json
+from gz_onboard.reports.tables import write_table
 
 SUMMARY_VERSION = 1
 TABLE_FORMATS = (".csv", ".parquet", ".jsonl")

@@ -244,7 +244,7 @@ class ActivityTracker:
 
 
 class VibrationMonitor:
-    """The vibration, as `offline.sensors.Vibration` defines it [m/s²], from windows of samples.
+    """The vibration, as `recording.sensors.Vibration` defines it [m/s²], from windows of samples.
 
     It starts again after a gap, or with a sensor that shows one and the same value: no accelerometer is that still.
     """

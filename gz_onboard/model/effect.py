@@ -219,7 +219,7 @@ class Effect:
     term: Equation
     decay: Equation | None
     stores_energy: bool
-    module: ModuleType = field(repr=False)  # with the traits that only offline tools read: see `offline.traits`
+    module: ModuleType = field(repr=False)  # with the traits that only offline tools read: see `model.traits`
 
     @property
     def reads(self) -> frozenset[str]:

@@ -1,7 +1,7 @@
 """Functions that effects, battery and controller are written with: elementary functions and tables.
 
 Elementary functions take floats and numpy arrays alike; numpy is imported only where an array comes. Tables
-take floats; `offline.series` reads them for arrays. They are straight between their points. The circuit of a cell is
+take floats; `model.series` reads them for arrays. They are straight between their points. The circuit of a cell is
 geometric over temperature, straight in the logarithm: resistances fall nearly exponentially with it (Arrhenius), and a
 straight line between two temperatures is a tenth too high where they are 20 K apart.
 """

@@ -5,7 +5,7 @@
 
 ``status`` is measured, data sheet or guess. A parameter that the file leaves out takes its prior, as a guess: that of a
 scooter, scaled to this vehicle (`Parameter.grows_with`). Parameters without a usable prior are required of a file with
-a battery. The correlations of parameters that were found together are for offline tools, see `offline.correlations`.
+a battery. The correlations of parameters that were found together are for offline tools, see `priors`.
 """
 
 from __future__ import annotations

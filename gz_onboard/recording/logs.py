@@ -10,12 +10,13 @@ CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import mmap
 import re
 import zlib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -212,6 +213,31 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
             raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
     return logs
+
+
+def digest_of(file: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal. InputError if it cannot be read."""
+    try:
+        with file.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable(file, error) from None
+
+
+def distinct_logs(paths: Iterable[Path]) -> list[Path]:
+    """Return the logs of `logs_among`, each content once, with a warning for each that is left out."""
+    logs = logs_among(paths)
+    sizes = Counter(log.stat().st_size for log in dict.fromkeys(logs) if log.is_file())
+    first: dict[object, Path] = {}
+    for log in logs:
+        again = log.is_file() and sizes[log.stat().st_size] > 1
+        which = digest_of(log) if again else log
+        if (kept := first.get(which)) is None:
+            first[which] = log
+        else:
+            said = "is given twice" if kept == log else f"is the same log as {kept}"
+            _LOG.warning("%s: %s; it counts once", log, said)
+    return list(first.values())
 
 
 def log_stem(log: Path) -> str:

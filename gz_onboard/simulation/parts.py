@@ -265,7 +265,7 @@ TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; bo
 class FirstOrderPack:
     """Equivalent circuit of one cell, R0 and one RC pair over SOC and temperature (eqs. 2.20-2.24).
 
-    effects: their voltages [V] after one step, by `offline.series.stepper` with the `dt` of `draw`; they act in the
+    effects: their voltages [V] after one step, by `model.series.stepper` with the `dt` of `draw`; they act in the
     next step. quantities: read by the effects; the pack keeps those of the cells up to date. Voltage lost to effects
     is heat, and so is the energy that the RC pair's capacitor stores for a minute: heat = S·P·(V_oc - V_cell)·I_cell.
     """

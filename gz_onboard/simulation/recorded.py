@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, held_at, running_mean
 from gz_onboard.can.codec import LONGEST_PAUSE_NS
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
@@ -22,12 +22,11 @@ from gz_onboard.events import Estimate
 from gz_onboard.model.battery import discharged
 from gz_onboard.model.effect import Port
 from gz_onboard.model.model import standing_load
-from gz_onboard.offline.arrays import block_means, held_at, running_mean
-from gz_onboard.offline.sensors import speed_role, true_columns
-from gz_onboard.offline.series import first_soc
+from gz_onboard.model.series import first_soc
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.decode import feed
 from gz_onboard.recording.recording import open_ride, read_recording, ride_name
+from gz_onboard.recording.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle

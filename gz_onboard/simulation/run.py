@@ -15,10 +15,9 @@ from operator import attrgetter
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, stretches
 from gz_onboard.errors import brief
 from gz_onboard.model.drawable import drawable
-from gz_onboard.offline.arrays import stretches
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts import Rider
 from gz_onboard.simulation.scooter import Scooter

@@ -13,12 +13,12 @@ from operator import mul
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
+from gz_onboard.model.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.model.effect import MOVING, QUANTITIES, Port
 from gz_onboard.model.functions import direction
 from gz_onboard.model.model import air_density, drag_torque
-from gz_onboard.offline.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
-from gz_onboard.offline.series import stepper
-from gz_onboard.offline.traits import traits
+from gz_onboard.model.series import stepper
+from gz_onboard.model.traits import traits
 from gz_onboard.simulation.parts import (
     Controller,
     Driveline,

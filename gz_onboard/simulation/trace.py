@@ -8,12 +8,11 @@ from operator import attrgetter
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.model.effect import MOVING, Port
 from gz_onboard.model.model import Bound
-from gz_onboard.offline.arrays import running_mean
-from gz_onboard.offline.series import all_quantities, over, total
+from gz_onboard.model.series import all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.turning import lean_of

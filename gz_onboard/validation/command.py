@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
-from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.options import add_shared
+from gz_onboard.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.progress import progress_bar
 from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.reports.results import descriptions, write_json

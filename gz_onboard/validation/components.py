@@ -18,11 +18,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.model.battery import discharged
+from gz_onboard.model.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.model.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.model.model import air_density, drag_torque
-from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
-from gz_onboard.offline.sensors import road_speed
-from gz_onboard.offline.series import (
+from gz_onboard.model.series import (
     all_quantities,
     heat,
     idle_loss,
@@ -33,6 +32,7 @@ from gz_onboard.offline.series import (
     terminal_voltage,
     total,
 )
+from gz_onboard.recording.sensors import road_speed
 from gz_onboard.simulation.parts import Dynamometer
 from gz_onboard.validation.comparison import CHANNELS, CONFIG, Comparison, Quantity
 from gz_onboard.vehicle import Vehicle

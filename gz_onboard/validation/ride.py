@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.model.battery import discharged
-from gz_onboard.offline.arrays import block_means, running_mean
-from gz_onboard.offline.processes import Task
-from gz_onboard.offline.series import curve_over
+from gz_onboard.model.series import curve_over
+from gz_onboard.processes import Task
 from gz_onboard.progress import Progress
 from gz_onboard.recording.recording import facts_of, ride_name, rider_mass
 from gz_onboard.simulation.parts import Dynamometer, Place, RoadProfile

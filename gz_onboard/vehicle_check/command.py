@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input
-from gz_onboard.offline.correlations import correlations
-from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.options import LOG_SUFFIXES, add_shared
+from gz_onboard.priors import correlations
 from gz_onboard.progress import progress_bar
+from gz_onboard.recording.logs import distinct_logs
 from gz_onboard.reports.results import Failure, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 from gz_onboard.vehicle_check import new

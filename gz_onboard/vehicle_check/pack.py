@@ -18,7 +18,7 @@ from gz_onboard.estimation.summary import GAUGE_SD, gains
 from gz_onboard.estimator.plausibility.residual import CONFIG
 from gz_onboard.model.battery import Battery
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.series import all_quantities, soc_at_load
+from gz_onboard.model.series import all_quantities, soc_at_load
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.finding import Expected, Finding, Looks, right, unknown, wrong
 from gz_onboard.vehicle_check.seconds import FEWEST, SECOND, Seconds, rate, relation, unit_of

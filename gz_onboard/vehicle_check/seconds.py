@@ -11,8 +11,8 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.can.mapping import UNITS, known_units, to_si
 from gz_onboard.discovery.grid import averaged, delays, measured
-from gz_onboard.offline.sensors import true_columns
 from gz_onboard.recording.recording import Recording
+from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each

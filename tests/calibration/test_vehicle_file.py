@@ -16,7 +16,7 @@ from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.vehicle_file import merged, write_vehicle
 from gz_onboard.errors import InputError
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.correlations import correlations
+from gz_onboard.priors import correlations
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.test_vehicle import with_effect
 

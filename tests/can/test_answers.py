@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gz_onboard.can.codec import RANGE, Codec
 from gz_onboard.can.requests import SEQUENCE, Assembler
 from gz_onboard.events import Frame
-from gz_onboard.offline.decode_signals import Decoder
+from gz_onboard.export.decoder import Decoder
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, events_of

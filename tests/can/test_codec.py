@@ -16,7 +16,7 @@ from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.can.layout import crc8_sae_j1850, identifiers_of
 from gz_onboard.can.mapping import BusMapping, Source, read_mapping, to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
-from gz_onboard.offline.decode_signals import Decoder
+from gz_onboard.export.decoder import Decoder
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, events_of

@@ -46,11 +46,11 @@ from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.parameters import candidates
 from gz_onboard.discovery.residuals import cell_temperature, counted_soc
 from gz_onboard.discovery.search import one_degree
-from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.model.effect import load_effect, package_effects
 from gz_onboard.model.model import standing_load
-from gz_onboard.offline.series import all_quantities, total
-from gz_onboard.offline.traits import traits
+from gz_onboard.model.series import all_quantities, total
+from gz_onboard.model.traits import traits
+from gz_onboard.priors import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import LOGS, cell_voltage

@@ -15,10 +15,10 @@ from gz_onboard.estimator import forecast as forecast_module
 from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.saved_state import check
+from gz_onboard.model.cooling import LumpedCooling
 from gz_onboard.model.drawable import cells_ahead, pack_constants
 from gz_onboard.model.effect import load_effect
 from gz_onboard.model.model import Model
-from gz_onboard.offline.cooling import LumpedCooling
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)

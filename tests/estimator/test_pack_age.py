@@ -17,7 +17,7 @@ from gz_onboard.estimator.pack_age import AGE, FIELDS, Belief, PackAge, believe,
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
 from gz_onboard.estimator.saved_state import check
 from gz_onboard.model.battery import Battery, Health
-from gz_onboard.offline.series import advanced
+from gz_onboard.model.series import advanced
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
 from tests.support import cell_voltage

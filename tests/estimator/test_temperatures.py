@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gz_onboard.events import Group
-from gz_onboard.offline.cooling import LumpedCooling
-from gz_onboard.offline.series import advanced
+from gz_onboard.model.cooling import LumpedCooling
+from gz_onboard.model.series import advanced
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import EventEstimator
 from tests.support import cell_voltage

@@ -17,7 +17,7 @@ from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW, Group, RoleWindow
 from gz_onboard.model.effect import load_effect
-from gz_onboard.offline.sensors import Vibration
+from gz_onboard.recording.sensors import Vibration
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
 from tests.events import EventEstimator

@@ -14,7 +14,7 @@ from gz_onboard.calibration.cooling import dissipation
 from gz_onboard.model.battery import current_of
 from gz_onboard.model.drawable import DISCHARGE, drawable
 from gz_onboard.model.functions import Mesh
-from gz_onboard.offline.series import advanced, heat, terminal_voltage
+from gz_onboard.model.series import advanced, heat, terminal_voltage
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

@@ -13,8 +13,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.model.effect import QUANTITIES, Port, effects_in, load_effect, package_effects
 from gz_onboard.model.model import Bound, stepping
 from gz_onboard.model.parameters import declared_parameters
-from gz_onboard.offline.series import over
-from gz_onboard.offline.traits import traits
+from gz_onboard.model.series import over
+from gz_onboard.model.traits import traits
 
 EFFECTS = [load_effect(name) for name in package_effects()]
 CONSERVATIVE = {"inertia", "grade_force", "headwind"}  # what they take they give back; the wind gives of its own

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.model.functions import mean_response
-from gz_onboard.offline.series import relaxation
+from gz_onboard.model.series import relaxation
 
 steps = st.lists(st.tuples(st.floats(-5, 5), st.floats(0, 1)), min_size=1, max_size=30)
 

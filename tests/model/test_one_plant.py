@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.arrays import block_means
 from gz_onboard.calibration.circuit import Circuit, Reaction, voltage
 from gz_onboard.calibration.coastdown_run import Coast
 from gz_onboard.calibration.cooling import ENTROPY, ENTROPY_SOC, CoolingRun, motor_temperatures, pack_temperatures
@@ -20,8 +21,7 @@ from gz_onboard.estimator.cells import Cell
 from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.model.functions import Mesh, PiecewiseLinear
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.arrays import block_means
-from gz_onboard.offline.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
+from gz_onboard.model.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
 from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import FirstOrderPack, Rider
 from gz_onboard.simulation.scooter import STEP, Scooter

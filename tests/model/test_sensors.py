@@ -8,7 +8,7 @@ import pytest
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.model.sensors import grade_shown, speed_factors
-from gz_onboard.offline.sensors import road_speed, speed_role, true_columns
+from gz_onboard.recording.sensors import road_speed, speed_role, true_columns
 
 P = {
     "pack_current_offset": 0.5,

@@ -12,9 +12,9 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard.cli import main
+from gz_onboard.estimation.report import changed_by, path_of
 from gz_onboard.estimation.summary import Why
 from gz_onboard.estimator.load_model import Ledger
-from gz_onboard.lab.report import changed_by, path_of
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.recording import Recording
 from tests.support import LOGS, write_log

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.model.cooling import InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.model.model import air_density
-from gz_onboard.offline.cooling import InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.simulation.parts import Driveline, FirstOrderPack, Rider, straight
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle

@@ -17,9 +17,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.arrays import block_means
 from gz_onboard.cli import main
 from gz_onboard.model.model import Model
-from gz_onboard.offline.arrays import block_means
 from gz_onboard.recording.recording import read_recording
 from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.validation.command import KEYS

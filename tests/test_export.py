@@ -19,8 +19,8 @@ from gz_onboard.can.codec import Codec
 from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
-from gz_onboard.lab import export as command
-from gz_onboard.offline.decode_signals import Decoder, column_name
+from gz_onboard.export import command
+from gz_onboard.export.decoder import Decoder, column_name
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_frames, read_samples
 from gz_onboard.vehicle import read_vehicle

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
-from gz_onboard.offline.decode_signals import Decoder
+from gz_onboard.export.decoder import Decoder, column_name
 from gz_onboard.recording import logs
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Fr
             file.channel(topic, json.loads(schema), of_channel)
         for message in decoder.all_messages:
             if topics[message.name] not in recorded:
-                file.channel(topics[message.name], _message_schema(message, decoder.columns[message.name]))
+                file.channel(topics[message.name], _message_schema(message))
 
         def logged() -> Iterator[list[Frame]]:
             file.frames(first)
@@ -118,7 +118,6 @@ def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Fr
     return count
 
 
-def _message_schema(message: Message, columns: Mapping[str, str]) -> dict[str, Any]:
-    pairs = zip(columns.items(), message.signals, strict=True)
-    texts = {name: ", ".join(filter(None, (unit, signal.comment))) for (name, unit), signal in pairs}
+def _message_schema(message: Message) -> dict[str, Any]:
+    texts = {column_name(s): ", ".join(filter(None, (s.unit or "", s.comment))) for s in message.signals}
     return object_schema(message.name, texts)

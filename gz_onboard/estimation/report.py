@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gz_onboard.arrays import held_at
 from gz_onboard.constants import WH
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, known_vehicle, open_estimate, run_ride, vehicle_of
@@ -19,11 +20,10 @@ from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.estimator.signals import FIX_2D
 from gz_onboard.events import TOLD, cause_words, words
 from gz_onboard.log_rows import ESTIMATE_TOPIC
-from gz_onboard.offline.arrays import held_at
-from gz_onboard.offline.digest import distinct_logs
-from gz_onboard.offline.processes import Task, collect, over_rides
 from gz_onboard.options import add_shared
+from gz_onboard.processes import Task, collect, over_rides
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.recording.logs import distinct_logs
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable
 from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance

@@ -23,21 +23,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
-from gz_onboard.lab.export_contents import contents_text, log_contents
-from gz_onboard.lab.export_tables import (
+from gz_onboard.export.contents import (
     ESTIMATES,
-    DecoderError,
+    FRAME,
     ExportSource,
-    decoder_of,
-    holds_frames,
-    signals_of,
+    contents_text,
+    frame_columns,
     write_estimates,
     write_signals,
 )
-from gz_onboard.offline.write_logs import out_suffix, whole, write_frames_as, write_mcap
-from gz_onboard.offline.write_tables import FRAME, frame_columns, write_table
+from gz_onboard.export.decoder import DecoderError, decoder_of
+from gz_onboard.export.logs import out_suffix, whole, write_frames_as, write_mcap
 from gz_onboard.options import add_shared
 from gz_onboard.recording import logs
+from gz_onboard.reports.tables import write_table
 from gz_onboard.vehicle import read_vehicle
 
 _TABLES = (".csv", ".parquet", ".jsonl")
@@ -81,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     if out is None:
         if unfit := [name for name, field in _OF_OUTPUT.items() if getattr(arguments, field)]:
             raise InputError(f"{unfit[0]}: chooses what is written to OUT, which is missing; name a file or folder")
-        return _each(logs.logs_among([log], estimates=None), lambda log: print(contents_text(log_contents(log))))
+        return _each(logs.logs_among([log], estimates=None), lambda log: print(contents_text(log)))
     suffix = out_suffix(out)
     if suffix and arguments.table_format:
         raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
@@ -128,13 +127,10 @@ def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) ->
 
 
 def _write(arguments: argparse.Namespace, source: ExportSource, part: Path, suffix: str) -> str:
-    """Write what is asked for to `part`, in the format of `suffix`, none for a folder; gives what it was."""
+    """Write what is asked for to `part`, in the format of `suffix`, none for a folder; return what it was."""
     kind = suffix or f"/.{arguments.table_format or 'parquet'}"
-    has_frames, topics = holds_frames(source.log), logs.json_channels(source.log)
-    if arguments.estimates:
-        return _estimates(arguments, source, part, kind, ["estimate"])
-    told = [name for name, topic in ESTIMATES.items() if topic in topics]
-    if not has_frames and told and not arguments.signals and not arguments.frames:
+    told = ["estimate"] if arguments.estimates else [name for name, t in ESTIMATES.items() if t in source.topics]
+    if arguments.estimates or (told and not (source.has_frames or arguments.signals or arguments.frames)):
         return _estimates(arguments, source, part, kind, told)
     if arguments.frames or not (arguments.signals or suffix in (".parquet", ".jsonl", ".mcap", "")):
         return _frames(source, part, suffix)
@@ -148,21 +144,21 @@ def _write(arguments: argparse.Namespace, source: ExportSource, part: Path, suff
 
 
 def _estimates(arguments: argparse.Namespace, source: ExportSource, part: Path, kind: str, names: Sequence[str]) -> str:
-    """Of a folder the tables `names` of `ESTIMATES`, else the estimates."""
-    if not kind.startswith("/"):
-        if kind not in _TABLES:
-            raise InputError(f"{arguments.out}: estimates can be written to {', '.join(_TABLES)} or a directory")
-        files = {ESTIMATES["estimate"]: part}
-    else:
+    """Write the tables `names` of `ESTIMATES` into a folder, or the estimates into a file."""
+    if kind.startswith("/"):
         part.mkdir(parents=True, exist_ok=True)
         files = {ESTIMATES[name]: part / f"{name}{kind[1:]}" for name in names}
+    elif kind in _TABLES:
+        files = {ESTIMATES["estimate"]: part}
+    else:
+        raise InputError(f"{arguments.out}: estimates can be written to {', '.join(_TABLES)} or a directory")
     return f"{write_estimates(source, files)} estimates"
 
 
 def _frames(source: ExportSource, part: Path, suffix: str) -> str:
     if source.columns is not None:
         raise InputError("--columns: applies to estimates or signals, with --estimates or --signals")
-    _, frames = source.frames()
+    frames = source.frames()
     if suffix in ("", ".mcap"):
         raise InputError("--frames: can be written to .log .blf .asc .trc .csv .mf4 .parquet .jsonl")
     if suffix in (".parquet", ".jsonl"):
@@ -174,15 +170,17 @@ def _frames(source: ExportSource, part: Path, suffix: str) -> str:
 
 def _signals(arguments: argparse.Namespace, source: ExportSource, part: Path, kind: str) -> str:
     vehicle = read_vehicle(arguments.vehicle) if arguments.vehicle else None
-    if kind == ".mcap" and holds_frames(source.log):
-        section, frames = source.frames()
-        decoder = decoder_of(source.log, arguments.dbc, vehicle)
+    files = arguments.dbc or ()
+    if kind == ".mcap" and source.has_frames:
+        frames, decoder = source.frames(), decoder_of(source.log, files, vehicle)
         if source.columns is not None:
             raise InputError("--columns: an .mcap has all that is in the log")
-        text = f"{write_mcap(source.log, part, decoder, frames.batches(), section)} samples"
+        text = f"{write_mcap(source.log, part, decoder, frames.batches(), source.section)} samples"
+    elif not kind.startswith("/") and kind not in _TABLES:
+        raise InputError(f"{source.log}: its signals can be written to .csv, .parquet, .jsonl, .mcap or a directory")
     else:
-        found = signals_of(source, arguments.dbc, vehicle)
-        count = write_signals(source, part, kind, found)
+        found = source.signals(files, vehicle)
+        count = write_signals(found, part, kind)
         if found.decoder is None:
             return f"{count} rows of signals, as they were logged once a second"
         text, decoder = f"{count} frames", found.decoder

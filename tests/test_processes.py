@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.offline.processes import Task, over_rides
+from gz_onboard.processes import Task, over_rides
 from gz_onboard.progress import Progress
 from tests.support import HEARS_CTRL_C, ROOT
 
 LONG, ENOUGH = 600, 60  # s
-SCRIPT = "from tests.offline.test_processes import main; main()"
+SCRIPT = "from tests.test_processes import main; main()"
 
 
 def work(task: Task, _: Progress) -> None:

@@ -1,28 +1,38 @@
-"""Decode all signals of recorded frames, in the units of the DBC, for tables and for an MCAP of signals."""
+"""Decode all signals of recorded frames, in the units of the DBC files."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.can.codec import LENGTH
+from gz_onboard.can.dbc import database_of, load_database
 from gz_onboard.can.layout import MessageSignals, Values
 from gz_onboard.can.mapping import BusMapping
 from gz_onboard.can.origins import Origins
 from gz_onboard.can.requests import NEGATIVE, answer_readers
+from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
+from gz_onboard.recording import logs
+from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
 Decoded = tuple[int, str, Values]
-"""(time [ns], message, value by column): one frame's signals."""
+"""Time [ns], message and values by column of one frame."""
+
+
+class DecoderError(InputError):
+    """A log that does not say what decodes it."""
 
 
 class Decoder:
-    """Decodes all signals of the frames of one bus, and of answers; counts the frames that it cannot decode."""
+    """Decodes the frames of one bus, and the answers to requests, and counts those that it cannot decode."""
 
     def __init__(self, mapping: BusMapping) -> None:
         self.unknown = self.copies = 0
@@ -30,14 +40,14 @@ class Decoder:
         messages, requests = mapping.database.messages, mapping.requests
         self.origins = Origins(mapping, {message.name for message in messages})
         self.all_messages: list[Message] = [*messages, *(request.message for request in requests)]
-        self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
+        self.columns = {m.name: [column_name(s) for s in m.signals] for m in self.all_messages}
         self._signals = {message.name: MessageSignals(message, mapping.not_available) for message in messages}
         self._signals |= {request.name: MessageSignals(request.message, not_available=False) for request in requests}
         self._answers = answer_readers(requests, self._faults)
         self._asked = {request.request for request in requests}
 
     def decode(self, batches: Iterable[list[Frame]]) -> Iterator[Decoded]:
-        """One item for each frame that the bus knows, and for each answer."""
+        """Yield one item for each frame that the bus knows, and for each answer."""
         for batch in batches:
             for time_ns, identifier, data, channel in batch:
                 if answers := self._answers.get(identifier):
@@ -64,5 +74,32 @@ class Decoder:
 
 
 def column_name(signal: Signal) -> str:
-    """``name[unit]``, or the name alone for a signal without a unit."""
+    """Return ``name[unit]``, or the name alone for a signal without a unit."""
     return f"{signal.name}[{signal.unit}]" if signal.unit else signal.name
+
+
+def decoder_of(log: Path, files: Sequence[Path], vehicle: Vehicle | None) -> Decoder:
+    """Return the decoder of `log`.
+
+    It decodes by DBC `files`; else by those of a vehicle; else by those attached to the log; else by those of the
+    package's own vehicle that the log names. `DecoderError` if there are none of these.
+    """
+    if files:
+        return Decoder(BusMapping(load_database(list(files), {}), tuple(files), (), {}, {}))
+    attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
+    if not vehicle and not attached:
+        named = logs.read_metadata(log).get("vehicle", "")
+        own = (read_vehicle(file.stem) for file in sorted(OWN.glob("*.toml")) if named)
+        vehicle = next((one for one in own if named in (one.name, one.file.stem)), None)
+    if vehicle:
+        if not vehicle.mapping.reads_frames:
+            raise vehicle.error("dbc is missing: without it no frame can be decoded")
+        database = load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {})  # range frames are its own
+        return Decoder(replace(vehicle.mapping, database=database))
+    if not attached:
+        raise DecoderError(f"{log}: no DBC file is attached to this log; give a vehicle or DBC files")
+    texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
+    try:
+        return Decoder(BusMapping(database_of(texts, {}), (), (), {}, {}))
+    except InputError as error:
+        raise DecoderError(f"{error}; give a vehicle or DBC files") from error

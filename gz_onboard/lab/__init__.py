@@ -1,1 +1,0 @@
-"""Offline work on recorded rides; never imported on board."""
