@@ -27,7 +27,7 @@ from gz_onboard.recording.logs import distinct_logs
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable
 from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance
-from gz_onboard.reports.page import drawn, html_table, page, tiles
+from gz_onboard.reports.page import Bar, bar_table, drawn, html_table, page, tiles
 from gz_onboard.reports.results import FIRST_DATE_NS, clock, number
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, find_vehicle
@@ -35,7 +35,7 @@ from gz_onboard.vehicle import Vehicle, find_vehicle
 LEAST_WH = 0.05
 """Smaller entries of the ledger are left out."""
 LONGEST_GAP_S = 10.0
-"""Recording further apart have a hole between them."""
+"""Samples further apart have a hole between them."""
 MOST_CHANGES = 20
 TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")
 """Causes that a sensor which is left out may have taught."""
@@ -199,14 +199,8 @@ def page_of(rides: Sequence[RideSection]) -> str:
     if len(rides) == 1:
         return page(rides[0].cells[0], [rides[0].html])
     heads = ("ride", "start", "time", "km", "Wh/km", "SOC", "range left, km")
-    lines = [
-        f'<tr><td><a href="#{ride.anchor}">{html.escape(ride.cells[0])}</a></td>'
-        + "".join(f'<td class="n">{cell}</td>' for cell in ride.cells[1:])
-        for ride in rides
-    ]
-    head = "".join(f"<th{' class=n' if i else ''}>{text}</th>" for i, text in enumerate(heads))
+    contents = html_table(heads, [ride.cells for ride in rides], range(1, 7), [ride.anchor for ride in rides])
     title = f"{len(rides)} rides"
-    contents = f'<div class="scroll"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
     return page(title, [f"<h1>{title}</h1>", contents, *(ride.html for ride in rides)])
 
 
@@ -243,20 +237,17 @@ def _soc(s: RideSummary) -> str:
 
 def _tiles(ride: ReportedRide) -> str:
     s = ride.summary
-    band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
+    recovered = number(s.energy_recovered_wh, ".0f", "Wh")
     missing = missing_energy(s)
     over = f"over {s.energy_distance_km:.2f} km: {missing}" if missing else "over the ride"
+    band = f"{number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
     return tiles(
         [
             ("distance", number(s.distance_km, ".2f", "km"), f"in {clock(s.duration_s)}"),
-            (
-                "energy",
-                number(s.energy_wh, ".0f", "Wh"),
-                f"drawn, {number(s.energy_recovered_wh, '.0f', 'Wh')} recovered",
-            ),
+            ("energy", number(s.energy_wh, ".0f", "Wh"), f"drawn, {recovered} recovered"),
             ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), over),
             ("soc", _soc(s), f"state of charge, ± {number(s.soc_end_sd, '.1f', '%', 100)}"),
-            ("range", number(s.range_end_km, ".1f", "km"), band),
+            ("range", number(s.range_end_km, ".1f", "km"), f"range left, {band}"),
         ]
     )
 
@@ -276,33 +267,25 @@ def _charts(ride: ReportedRide) -> Iterable[str]:
     yield f"<h3>Over time</h3>{drawn(figure, 'range, charge, pack, motion, consumption, temperatures and state')}"
 
 
-def _bar(begin: float, end: float, low: float, high: float, colour: str) -> str:
-    """A cell of a table with a bar from `begin` to `end` on an axis from `low` to `high`."""
-    scale = 100 / (high - low or 1.0)
-    left, width = (min(begin, end) - low) * scale, abs(end - begin) * scale
-    return f'<td class="bar"><i class="{colour}" style="margin-left:{left:.1f}%;width:{width:.1f}%"></i></td>'
-
-
 def _ledger(ride: ReportedRide) -> str:
     """The energy by effect of the model, and the rest of the measured energy."""
     drawn_wh, distance = ride.summary.energy_wh, ride.ledger_km
-    entries = [(name, energy) for name, energy in ride.ledger_wh().items() if abs(energy) >= LEAST_WH]
+
+    def bar(name: str, energy: float, colour: str) -> Bar:
+        per_km = f"{energy / distance:z.1f}" if distance >= 0.1 else "–"
+        return Bar(name, 0.0, energy if colour else 0.0, colour, (f"{energy:z.1f}", per_km))
+
+    entries = {name: energy for name, energy in ride.ledger_wh().items() if abs(energy) >= LEAST_WH}
     if not entries:
         return ""
-    low, high = min(0.0, *(e for _, e in entries)), max(0.0, *(e for _, e in entries))
-
-    def row(name: str, bar: str, energy: float) -> str:
-        per_km = f"{energy / distance:z.1f}" if distance >= 0.1 else "–"
-        return f'<tr><td>{name}</td>{bar}<td class="n">{energy:z.1f}</td><td class="n">{per_km}</td></tr>'
-
-    lines = [row(html.escape(name), _bar(0.0, e, low, high, "blue" if e > 0 else "green"), e) for name, e in entries]
+    bars = [bar(name, energy, "blue" if energy > 0 else "green") for name, energy in entries.items()]
+    kind = "" if drawn_wh is None else "total"
     if drawn_wh is not None:
-        lines.append(row("drawn from the pack", "<td></td>", drawn_wh))
+        bars.append(bar("drawn from the pack", drawn_wh, ""))
     return (
         "<h3>Where the energy went</h3><p class=note>By the model, second by second. Beyond the model: measured less "
         "modelled. Not modelled: drawn while nothing was learned, as while charging, standing long or with a sensor in "
-        f'doubt. Negative: gained.</p><table class="{"" if drawn_wh is None else "total"}" data-of="ledger">'
-        f"<tr><th></th><th></th><th class=n>Wh</th><th class=n>Wh/km</th></tr>{''.join(lines)}</table>"
+        f"doubt. Negative: gained.</p>{bar_table('ledger', bars, ('Wh', 'Wh/km'), kind)}"
     )
 
 
@@ -315,21 +298,14 @@ def _why(why: Why | None) -> str:
     """From the rated range to that at the end, cause by cause."""
     if why is None:
         return ""
-    steps = [("rated range", 0.0, why.reference_km, "grey", "")]
+    bars = [Bar("rated range", 0.0, why.reference_km, "grey", (f"{why.reference_km:.1f}",))]
     for name, size in _largest(why.causes_km):
-        reached = steps[-1][2]
-        steps.append((cause_words(name), reached, reached + size, "green" if size > 0 else "red", "+"))
-    steps.append(("range", 0.0, why.range_km, "blue", ""))
-    high = max(end for _, _, end, _, _ in steps)
-    low = min(0.0, *(end for _, _, end, _, _ in steps))
-    lines = [
-        f"<tr><td>{html.escape(name)}</td>{_bar(begin, end, low, high, colour)}"
-        f"<td class=n>{end - begin:{sign}.1f}</td></tr>"
-        for name, begin, end, colour, sign in steps
-    ]
+        begin = bars[-1].end
+        bars.append(Bar(cause_words(name), begin, begin + size, "green" if size > 0 else "red", (f"{size:+.1f}",)))
+    bars.append(Bar("range", 0.0, why.range_km, "blue", (f"{why.range_km:.1f}",)))
     return (
         f"<h3>Why the range is not the rated one</h3><p class=note>At {clock(why.time_s)}, in km; causes below "
-        f'{TOLD:.0f} m are left out.</p><table data-of="why">{"".join(lines)}</table>'
+        f"{TOLD:.0f} m are left out.</p>{bar_table('why', bars)}"
     )
 
 

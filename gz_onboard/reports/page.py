@@ -8,7 +8,7 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 from gz_onboard.errors import writable
@@ -97,21 +97,49 @@ def tiles(values: Sequence[tuple[str, str, str]]) -> str:
     return f'<div class="tiles">{boxes}</div>'
 
 
-def html_table(heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """A table of texts; numbers: the columns to be aligned to the right."""
+def html_table(
+    heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = (), anchors: Sequence[str] = ()
+) -> str:
+    """A table of texts; numbers: the columns to be aligned to the right; anchors: the first cell of each row links."""
 
     def cell(i: int, text: str) -> str:
         kind = " class=bad" if isinstance(text, Failed) else " class=n" if i in numbers else ""
         return f"<td{kind}>{html.escape(text)}</td>"
 
     lines = ["".join(f"<th{' class=n' if i in numbers else ''}>{html.escape(h)}</th>" for i, h in enumerate(heads))]
-    for row in rows:
+    for i, row in enumerate(rows):
         if isinstance(row[0], Subheading):
             lines.append(f"<th colspan={len(heads)}>{html.escape(row[0])}</th>")
-        else:
-            lines.append("".join(cell(i, text) for i, text in enumerate(row)))
+            continue
+        cells = [cell(column, text) for column, text in enumerate(row)]
+        if anchors:
+            cells[0] = f'<td><a href="#{anchors[i]}">{html.escape(row[0])}</a></td>'
+        lines.append("".join(cells))
     wide = " wide" if len(heads) > 3 else ""
     return f'<div class="scroll{wide}"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+
+
+class Bar(NamedTuple):
+    """A row of a `bar_table`: a bar from `begin` to `end`, and numbers. colour: a class of the style; empty: no bar."""
+
+    name: str
+    begin: float
+    end: float
+    colour: str
+    cells: Sequence[str]
+
+
+def bar_table(key: str, bars: Sequence[Bar], heads: Sequence[str] = (), kind: str = "") -> str:
+    """A table with a horizontal bar in each row; key: its ``data-of``; kind: its class."""
+    low = min(0.0, *(min(bar.begin, bar.end) for bar in bars))
+    scale = 100 / (max(0.0, *(max(bar.begin, bar.end) for bar in bars)) - low or 1.0)
+    lines = [f"<tr><th></th><th></th>{''.join(f'<th class=n>{head}</th>' for head in heads)}</tr>"] if heads else []
+    for bar in bars:
+        left, width = (min(bar.begin, bar.end) - low) * scale, abs(bar.end - bar.begin) * scale
+        drawn = f'<i class="{bar.colour}" style="margin-left:{left:.1f}%;width:{width:.1f}%"></i>' if bar.colour else ""
+        cells = "".join(f"<td class=n>{cell}</td>" for cell in bar.cells)
+        lines.append(f'<tr><td>{html.escape(bar.name)}</td><td class="bar">{drawn}</td>{cells}</tr>')
+    return f'<table class="{kind}" data-of="{key}">{"".join(lines)}</table>'
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
