@@ -18,8 +18,8 @@ from gz_onboard.reports.style import (
     ORANGE,
     PURPLE,
     RED,
+    ChartPanel,
     Line,
-    Panel,
     chart,
     legend,
     new_figure,
@@ -119,14 +119,14 @@ def overview(
         at, name = (np.asarray(times) - c.time[0]) / unit, words(role).split()[0]
         warmth.append(Line(np.asarray(values), TEMPERATURE_COLOURS[role], name, 1.0, x=at))
     panels = [
-        Panel("range [km]", distance, 2.0, BLUE, limits=(0.0, farthest * 1.12)),  # whatever the gauge shows
-        Panel("SOC [%]", [_with_sd(c, "soc", 100, GREEN, "state of charge")], 1.3, GREEN),
-        Panel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
-        Panel("innovation\n[mV of a cell]", [innovation], 1.0, PURPLE, zero=True),
-        Panel("speed [km/h]", motion, 1.3, BLUE, "grade [%], lean [°]", zero=True),
-        Panel("consumption\n[Wh/km]", consumption, 1.3),
-        Panel("temperature\n[°C]", warmth),
-        Panel("", height=0.34 + 0.17 * len(reasons)),
+        ChartPanel("range [km]", distance, 2.0, BLUE, limits=(0.0, farthest * 1.12)),  # whatever the gauge shows
+        ChartPanel("SOC [%]", [_with_sd(c, "soc", 100, GREEN, "state of charge")], 1.3, GREEN),
+        ChartPanel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
+        ChartPanel("innovation\n[mV of a cell]", [innovation], 1.0, PURPLE, zero=True),
+        ChartPanel("speed [km/h]", motion, 1.3, BLUE, "grade [%], lean [°]", zero=True),
+        ChartPanel("consumption\n[Wh/km]", consumption, 1.3),
+        ChartPanel("temperature\n[°C]", warmth),
+        ChartPanel("", height=0.34 + 0.17 * len(reasons)),
     ]
     figure = chart([[panel] for panel in panels], x, x_name, title, about, left=0.125)
     _states(figure.axes[len(panels) - 1], x, c, reasons)
@@ -171,7 +171,7 @@ def range_over_distance(rows: Sequence[Row]) -> Figure:
     if len(known) and not c.where("activity", Activity.CHARGING.name).any():
         end = np.array([0.0, ridden[known[-1]]])
         lines.append(Line(forecast.y[known[-1]] + end[::-1], MUTED, "what it came to", style="--", x=end))
-    figure = chart([[Panel("range [km]", lines, 2.2, BLUE)]], ridden, "distance [km]", left=0.06)
+    figure = chart([[ChartPanel("range [km]", lines, 2.2, BLUE)]], ridden, "distance [km]", left=0.06)
     figure.axes[0].set_ylim(bottom=0)
     return figure
 

@@ -127,7 +127,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Panel:
+class ChartPanel:
     """One ordinate of a chart, or two. name, right: with unit; zero: whether a line is drawn there."""
 
     name: str
@@ -169,7 +169,7 @@ def _right_ordinate(axis: Axes, name: str, colour: str) -> Axes:
 
 
 def chart(
-    rows: Sequence[Sequence[Panel]], x: Array, x_name: str, title: str = "", about: str = "", left: float = 0.08
+    rows: Sequence[Sequence[ChartPanel]], x: Array, x_name: str, title: str = "", about: str = "", left: float = 0.08
 ) -> Figure:
     """Panels one above the other, in one column or more, over the common abscissa `x` of shape (n,).
 

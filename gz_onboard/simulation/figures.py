@@ -19,8 +19,8 @@ from gz_onboard.reports.style import (
     ORANGE,
     PURPLE,
     RED,
+    ChartPanel,
     Line,
-    Panel,
     chart,
     headline,
     new_figure,
@@ -70,12 +70,12 @@ def overview(run: Run, title: str) -> Figure:
     if hilly:
         energy.append(Line(s["grade"] * 100, MUTED, "grade", 0.8, right=True))
     panels = [
-        Panel("speed [km/h]", speed, 1.7),
-        Panel("rider [%]", rider),
-        Panel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
-        Panel("SOC [%]", [Line(s["soc"] * 100, GREEN, "state of charge", 1.4)]),
-        Panel("temperature [°C]", warmth),
-        Panel("energy [Wh]", energy, 1.2, BLUE, "grade [%]" if hilly else None),
+        ChartPanel("speed [km/h]", speed, 1.7),
+        ChartPanel("rider [%]", rider),
+        ChartPanel("voltage [V]", pack, 1.3, PURPLE, "current [A]", ORANGE),
+        ChartPanel("SOC [%]", [Line(s["soc"] * 100, GREEN, "state of charge", 1.4)]),
+        ChartPanel("temperature [°C]", warmth),
+        ChartPanel("energy [Wh]", energy, 1.2, BLUE, "grade [%]" if hilly else None),
     ]
     return _over_time(run, panels, title)
 
@@ -98,7 +98,7 @@ def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
     measured: by the names of `run.COLUMNS`, of the length of the run's series; missing columns are not drawn.
     """
     panels = [
-        Panel(
+        ChartPanel(
             text,
             [
                 Line(measured[name] * factor, INK, "measured", 1.0),
@@ -112,7 +112,7 @@ def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
     return _over_time(run, panels, title)
 
 
-def _over_time(run: Run, panels: Sequence[Panel], title: str) -> Figure:
+def _over_time(run: Run, panels: Sequence[ChartPanel], title: str) -> Figure:
     unit, name = time_unit(run.duration)
     return chart([[panel] for panel in panels], run.series["time"] / unit, name, title)
 
@@ -190,7 +190,7 @@ def sweep_lines(sweeps: Sequence[Sweep], variants: Sequence[Variant], title: str
     """Draw range and consumption against one parameter."""
     shown = ("range_km", "range", "km", BLUE), ("consumption_wh_km", "consumption", "Wh/km", ORANGE)
     rows = [
-        [Panel(f"{name} [{unit}]", [Line(_column(variants, key), colour, name, 1.6, "o-")], 1.3, colour)]
+        [ChartPanel(f"{name} [{unit}]", [Line(_column(variants, key), colour, name, 1.6, "o-")], 1.3, colour)]
         for key, name, unit, colour in shown
     ]
     return chart(rows, np.array(sweeps[0].values), sweeps[0].label, title)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.reports.style import BLUE, GREEN, INK, ORANGE, Line, Panel, chart, save, time_unit
+from gz_onboard.reports.style import BLUE, GREEN, INK, ORANGE, ChartPanel, Line, chart, save, time_unit
 from gz_onboard.validation.comparison import CHANNELS, FORMS, Comparison, ValidatedRide
 
 COLOURS = {"open_loop": ORANGE, "predictive": BLUE, "components": GREEN}
@@ -33,7 +33,7 @@ def draw_ride(file: Path, ride: ValidatedRide, comparisons: Mapping[str, Mapping
     save(chart(rows, x, x_name, title, about, left=0.055), file, _DPI)
 
 
-def _row(forms: Mapping[str, Comparison], unit: float) -> tuple[Panel, Panel]:
+def _row(forms: Mapping[str, Comparison], unit: float) -> tuple[ChartPanel, ChartPanel]:
     """Values and errors of one quantity, over time in `unit` [s]."""
     values: list[Line] = []
     errors: list[Line] = []
@@ -48,7 +48,7 @@ def _row(forms: Mapping[str, Comparison], unit: float) -> tuple[Panel, Panel]:
         errors.append(Line(_mean(comparison), colour, name, 1.5, x=time))
     quantity = next(iter(forms.values())).quantity
     name = f"{quantity.label}\n[{quantity.unit.replace('degC', '°C')}]"
-    return Panel(name, values, 1.25), Panel("", errors, 1.25, zero=True)
+    return ChartPanel(name, values, 1.25), ChartPanel("", errors, 1.25, zero=True)
 
 
 def _mean(comparison: Comparison) -> Array:
