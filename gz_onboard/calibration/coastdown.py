@@ -1,39 +1,83 @@
 """Coast-downs: rolling resistance and drag area out of rolling to rest (Lord 2016, sec. 3.2; SAE J1263, J2263).
 
+    (m + J/r²)·dV/dt = -m·g·(c0·cos θ + c1·V + sin θ) - ½·ρ·CdA·(V + w)·|V + w| - P_motor(V/r)/V
+
 Runs in both directions of one track: its slope changes sign with the direction, the rest does not. Each run has a
-constant headwind of its own, unknown but for a prior. Force over spans of two seconds is fitted: the equation of motion
-is in `road_load`, the fit in `coastdown_fit`, what makes a run usable in `coastdown_run`.
+constant headwind w of its own, unknown but for a prior. The motor turns with the wheel: what it takes without current
+is taken off by the vehicle's own motor model. Air density is that of the measured temperature and altitude.
+
+Force over spans of two seconds is fitted by generalised least squares, all runs at once. The residual has two parts,
+both found by maximum likelihood: gusts, whose force grows with speed and lasts some seconds, and noise of the speed,
+which two neighbouring spans share with opposite signs. Without that, samples would count as independent and the
+standard deviations would be too small (Kariya & Kurata 2004).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations
 from math import sqrt
+from typing import Any
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import minimize, minimize_scalar
 
-from gz_onboard.arrays import Array
-from gz_onboard.calibration.coastdown_fit import RoadFit, covariance_with_inputs, fit_road
-from gz_onboard.calibration.coastdown_run import SLOWEST, SPAN, Coast, coast, directions
-from gz_onboard.calibration.fit import correlation, score
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.calibration.fit import Solution, correlation, linear, score
 from gz_onboard.calibration.result import Fit, Found, Panel, PlotLine, Result
-from gz_onboard.calibration.road_load import NAMES, RoadLoad, own_wind, roll
+from gz_onboard.calibration.table import Measurements
 from gz_onboard.constants import GRAVITY
-from gz_onboard.errors import InputError
-from gz_onboard.recording.recording import Recording
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.model.effect import ROAD_LOAD, Port
+from gz_onboard.model.effects.inertia import rotating_mass
+from gz_onboard.model.model import Bound, air_density
+from gz_onboard.model.series import all_quantities, total
+from gz_onboard.priors import correlations
+from gz_onboard.recording.recording import Recording, read_facts
+from gz_onboard.recording.sensors import road_speed, speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
-WIND_SD = 1.0  # m/s: a constant wind along the track on a day that was chosen for coast-downs
-SLOPE_SD = 0.01  # sine: a track that was chosen for coast-downs
+
+@dataclass(frozen=True)
+class CoastdownConfig:
+    """Which part of a run counts, and what is known without it."""
+
+    span: float = 2.0  # s
+    slowest: float = 1.0  # m/s: down to it the run is fitted
+    shortest: float = 10.0  # s
+    least_fall: float = 3.0  # m/s
+    driving: float = 0.01  # of the motor's greatest current, beside its offset: mean of a span of coasting
+    rising: float = 0.2  # m/s from one `rise_time` to the next
+    rise_time: float = 5.0  # s
+    closed: float = 0.02  # of the throttle: below is noise
+    wind_sd: float = 1.0  # m/s: a constant wind along the track on a day that was chosen for coast-downs
+    slope_sd: float = 0.01  # sine: a track that was chosen for coast-downs
+    speed_sd: float = 1e-3  # s/m: no tyre's rolling resistance grows faster (SAE J2452)
+    entered_mass_sd: float = 1.0  # kg: of a rider who was weighed, with clothes
+    density_sd: float = 0.015  # relative: of weather's pressure and of the thermometer
+    strongest_wind: float = 8.0  # m/s, in which nobody coasts down
 
 
-def calibrate(
+COASTDOWN = CoastdownConfig()
+NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
+UNITS = dict(zip(NAMES, ("1", "s/m", "m²"), strict=True))
+START = {"rolling_resistance_constant": 0.012, "rolling_resistance_speed": 0.0, "drag_area": 0.5}
+_STEP = {"rolling_resistance_constant": 1e-4, "rolling_resistance_speed": 1e-5, "drag_area": 1e-3, "slope": 1e-5}
+_MEASURED = (
+    "vehicle_speed motor_speed wheel_speed_rear throttle brake_switch motor_current ambient_temperature gps_altitude "
+    "gps_course"
+)
+_ROLES = {"speed": "vehicle_speed"} | {role: role for role in _MEASURED.split()}  # by column
+
+
+def coast_downs(
     runs: Sequence[Recording],
     vehicle: Vehicle,
     *,
-    wind_sd: float = WIND_SD,
-    slope_sd: float = SLOPE_SD,
+    wind_sd: float = COASTDOWN.wind_sd,
+    slope_sd: float = COASTDOWN.slope_sd,
     hold_out: bool = True,
 ) -> Result:
     """Rolling resistance and drag area of `vehicle` from coast-downs.
@@ -47,170 +91,554 @@ def calibrate(
     """
     if len(runs) < 2:
         raise InputError(f"{len(runs)} coast-down; at least 2 are needed, in both directions of one track")
-    twice = {run.name for run in runs if [r.name for r in runs].count(run.name) > 1}
-    if twice:
+    if twice := {run.name for run in runs if [r.name for r in runs].count(run.name) > 1}:
         raise InputError(f"coast-down {sorted(twice)[0]} is given twice")
     signs = directions(runs)
     coasts = [coast(run, vehicle, sign) for run, sign in zip(runs, signs, strict=True)]
-    result = Result("coastdown")
+    result, fit = Result("coastdown"), RoadFitter(coasts, vehicle, wind_sd, slope_sd)
+    best, covariance, shares = _fitted(fit, result)
     both = len(set(signs)) == 2
-    best, covariance, shares = _fitted(coasts, vehicle, wind_sd, slope_sd, result)
     if not both:
-        together = best.value(NAMES[0]) + signs[0] * best.solution["slope"]
+        together = best.value[NAMES[0]] + signs[0] * best.value["slope"]
         result.refusals.append(
             f"rolling_resistance_constant: all runs go one way ({runs[0].facts.get('direction', 'by GPS course')}), so "
             f"that the track's slope and rolling resistance are not separable: together {together:.4f}, apart known to "
             f"± {sqrt(covariance[0, 0]):.4f} only (the slope's prior, ± {slope_sd:g}); coast down the other way too"
         )
-    _report(result, best, coasts, vehicle, NAMES if both else NAMES[1:], covariance, wind_sd)
+    _report(result, fit, best, NAMES if both else NAMES[1:], covariance)
     largest = sorted(shares.items(), key=lambda item: -abs(item[1]))[:4]
     result.notes.append(
         f"part of the sd of drag_area from what was taken as given: "
         f"{', '.join(f'{name} {abs(share):.4f}' for name, share in largest)} m²"
     )
-    _correlation_note(result, covariance)
-    if "motor_current" in runs[0].columns:
-        offset = np.mean([_coasting_current(run, c) for run, c in zip(runs, coasts, strict=True)])
-        result.notes.append(f"motor current while coasting reads {offset:.2f} A in mean, taken as its sensor's offset")
-    if hold_out and len(coasts) > 2:
-        result.fits += _held_out(coasts, vehicle, best.held, wind_sd, slope_sd)
-    return result
-
-
-def _fitted(
-    coasts: Sequence[Coast], vehicle: Vehicle, wind_sd: float, slope_sd: float, result: Result
-) -> tuple[RoadFit, Array, dict[str, float]]:
-    """(the fit, covariance of `NAMES`, shares of what was taken as given in the sd of drag area).
-
-    Rolling resistance is held independent of speed, with a refusal, where that cannot be separated from drag.
-    """
-    free = fit_road(coasts, vehicle, {}, wind_sd, slope_sd)
-    covariance, shares = covariance_with_inputs(free, free, coasts, vehicle, NAMES)
-    if free.value(NAMES[1]) >= 2 * sqrt(covariance[1, 1]) and free.value(NAMES[2]) > 0:
-        return free, covariance, shares
-    best = fit_road(coasts, vehicle, {NAMES[1]: 0.0}, wind_sd, slope_sd, free.noise)
-    wide = fit_road(coasts, vehicle, {}, wind_sd, slope_sd, free.noise, best)
-    covariance, shares = covariance_with_inputs(wide, best, coasts, vehicle, NAMES)
-    speed_term, speed_sd = wide.value(NAMES[1]), sqrt(covariance[1, 1])
-    tie = covariance[:, 1] / covariance[1, 1]
-    # About the value that is held, not about the most likely one: its distance counts as an error too.
-    covariance = covariance + np.outer(tie, tie) * speed_term**2
-    why = "zero (less than 2 sd)"
-    if free.value(NAMES[2]) <= 0:
-        why = f"drag, whose area would be {free.value(NAMES[2]):.2f} m² beside it"
-    result.refusals.append(
-        f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m is indistinguishable from "
-        f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"
-    )
-    return best, covariance, shares
-
-
-def _coasting_current(run: Recording, c: Coast) -> float:
-    t, current = run.columns["motor_current"]
-    inside = (t >= c.time[0]) & (t <= c.time[-1])
-    return float(current[inside].mean()) if inside.any() else 0.0
-
-
-def _correlation_note(result: Result, covariance: Array) -> None:
     r = correlation(covariance)
     pairs = [f"{NAMES[i]} and {NAMES[j]} {r[i, j]:+.2f}" for i, j in combinations(range(len(NAMES)), 2)]
     result.notes.append(f"correlations: {', '.join(pairs)}")
+    if hold_out and len(coasts) > 2:
+        result.fits += _held_out(fit, best.held)
+    return result
 
 
-def _report(
-    result: Result,
-    road: RoadFit,
-    runs: Sequence[Coast],
-    vehicle: Vehicle,
-    names: Sequence[str],
-    covariance: Array,
-    wind_sd: float,
-) -> None:
+def _report(result: Result, fit: RoadFitter, road: RoadFit, names: Sequence[str], covariance: Array) -> None:
     """Parameters, notes and plots of `road` into `result`; `covariance` is over all `NAMES`."""
-    solution = road.solution
-    force = road.force(vehicle)
-    speeds = [roll(force, run, solution["slope"], solution[f"wind {run.name}"], run.time) for run in runs]
+    runs, value, span = fit.runs, road.value, COASTDOWN.span
+    force = RoadLoad(fit.vehicle, value)
+    speeds = [roll(force, run, value["slope"], value[f"wind {run.name}"]) for run in runs]
     data, model = np.concatenate([run.speed for run in runs]), np.concatenate(speeds)
-    fit = score("speed, coasting, own wind", "m/s", data, model, held_out=False, source=_names(runs))
-    result.fits.append(fit)
+    scored = score("speed, coasting, own wind", "m/s", data, model, held_out=False, source=_names(runs))
+    result.fits.append(scored)
     cold, warm = min(run.temperature for run in runs), max(run.temperature for run in runs)
-    ups = sum(run.direction > 0 for run in runs)
+    ups = [run.name for run in runs if run.direction > 0]
     points = sum(len(run.middle) for run in runs)
     source = (
-        f"{len(runs)} coast-downs ({ups} one way, {len(runs) - ups} the other), {points} spans of {SPAN:g} s, "
-        f"{cold:.0f} to {warm:.0f} degC, {data.min():.1f} to {data.max():.1f} m/s, "
-        f"own wind of {wind_sd:g} m/s sd; speed follows within {fit.rms:.2f} m/s rms"
+        f"{len(runs)} coast-downs ({len(ups)} one way, {len(runs) - len(ups)} the other), {points} spans of "
+        f"{span:g} s, {cold:.0f} to {warm:.0f} degC, {data.min():.1f} to {data.max():.1f} m/s, "
+        f"own wind of {fit.wind_sd:g} m/s sd; speed follows within {scored.rms:.2f} m/s rms"
     )
-    units = {NAMES[0]: "1", NAMES[1]: "s/m", NAMES[2]: "m²"}
     index = [NAMES.index(name) for name in names]
     for name, i in zip(names, index, strict=True):
         how = "held at zero: not distinguishable from it; " if name in road.held else ""
-        result.parameters[name] = Found(road.value(name), float(np.sqrt(covariance[i, i])), units[name], how + source)
+        result.parameters[name] = Found(value[name], float(np.sqrt(covariance[i, i])), UNITS[name], how + source)
     result.covariance.append((tuple(names), covariance[np.ix_(index, index)]))
-    up = next((run.name for run in runs if run.direction > 0), "none")
-    slope, slope_sd = 100 * solution["slope"], 100 * solution.sd("slope")
+    slope, slope_sd = 100 * value["slope"], 100 * road.solution.sd("slope")
+    up = ups[0] if ups else "none"
     result.notes.append(f"slope of the track {slope:.3f} ± {slope_sd:.3f} %, uphill in the direction of {up}")
-    winds = ", ".join(f"{run.name} {solution[f'wind {run.name}']:+.1f}" for run in runs)
-    sd = float(np.mean([solution.sd(f"wind {run.name}") for run in runs]))
+    winds = ", ".join(f"{run.name} {value[f'wind {run.name}']:+.1f}" for run in runs)
+    sd = float(np.mean([road.solution.sd(f"wind {run.name}") for run in runs]))
     result.notes.append(f"headwind of each run, m/s, ± {sd:.1f}: {winds}")
     noise = road.noise
     result.notes.append(
         f"left over: gusts of {noise.gust:.2f} m/s lasting {noise.lasting:.0f} s, speed noise of {noise.speed:.4f} m/s"
     )
-    result.panels += _panels(force, road, runs, speeds)
-
-
-def _names(runs: Sequence[Coast]) -> str:
-    return ", ".join(run.name for run in runs)
-
-
-def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Sequence[Array]) -> list[Panel]:
-    slope = road.solution["slope"]
     lines, errors, loads = [], [], []
-    for run, model in zip(runs, speeds, strict=True):
+    for run, speed in zip(runs, speeds, strict=True):
         time = run.time - run.time[0]
-        lines += [PlotLine(run.name, time, run.speed, "."), PlotLine("", time, model, "-")]
-        errors.append(PlotLine(run.name, time, run.speed - model, "-"))
-        level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
+        lines += [PlotLine(run.name, time, run.speed, "."), PlotLine("", time, speed, "-")]
+        errors.append(PlotLine(run.name, time, run.speed - speed, "-"))
+        level = run.slowing * (run.mass + force.rotating) - run.direction * value["slope"] * run.mass * GRAVITY
         loads.append(PlotLine(run.name, run.middle, level, "."))
-    v = np.linspace(SLOWEST, max(float(run.speed.max()) for run in runs), 50)
-    mass, temperature = (
-        float(np.mean(column)) for column in zip(*((r.mass, r.temperature) for r in runs), strict=True)
-    )
-    still = Coast("", v, v, 1, None, mass, temperature, 0.0)
-    loads.append(PlotLine("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
-    return [
+    v = np.linspace(COASTDOWN.slowest, max(float(run.speed.max()) for run in runs), 50)
+    mass, temperature = (float(np.mean(c)) for c in zip(*((r.mass, r.temperature) for r in runs), strict=True))
+    still = force(v, Coast("", v, v, 1, mass, temperature, 0.0), 0.0, 0.0)
+    loads.append(PlotLine("model, still air, motor included", v, still, "-"))
+    result.panels += [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),
         Panel("Coast-downs: residual", "time [s]", "measured less model [m/s]", tuple(errors)),
         Panel("Road load, slope taken off", "speed [m/s]", "force [N]", tuple(loads)),
     ]
 
 
-def _held_out(
-    runs: Sequence[Coast], vehicle: Vehicle, held: Mapping[str, float], wind_sd: float, slope_sd: float
-) -> list[Fit]:
+def _names(runs: Sequence[Coast]) -> str:
+    return ", ".join(run.name for run in runs)
+
+
+def _held_out(fit: RoadFitter, held: Mapping[str, float]) -> list[Fit]:
     """Each pair of runs, one each way, followed by a fit of the others: with its own wind free, and at no wind."""
+    runs = fit.runs
     by_direction = [[run for run in runs if run.direction == sign] for sign in (1, -1)]
     both = all(by_direction)
     pairs = list(zip(*by_direction, strict=False)) if both else [(run,) for run in runs]
-    data: list[Array] = []
-    free: list[Array] = []
-    still: list[Array] = []
+    rows = []
     for pair in pairs:
         rest = [run for run in runs if run.name not in [other.name for other in pair]]
         if not rest or (both and len({run.direction for run in rest}) < 2):
             continue
-        road = fit_road(rest, vehicle, held, wind_sd, slope_sd)
-        force, slope = road.force(vehicle), road.solution["slope"]
-        for run in pair:
-            data.append(run.speed)
-            still.append(roll(force, run, slope, 0.0, run.time))
-            free.append(roll(force, run, slope, own_wind(force, run, slope), run.time))
-    if not data:
+        road = replace(fit, runs=rest).fit(held)
+        force, slope = RoadLoad(fit.vehicle, road.value), road.value["slope"]
+        rows += [(run.speed, *(roll(force, run, slope, w) for w in (own_wind(force, run, slope), 0.0))) for run in pair]
+    if not rows:
         return []
     source = f"one {'pair' if both else 'run'} at a time left out of {_names(runs)}"
-    measured = np.concatenate(data)
+    measured, free, still = (np.concatenate(column) for column in zip(*rows, strict=True))
     return [
-        score("speed, own wind free", "m/s", measured, np.concatenate(free), held_out=True, source=source),
-        score("speed, no wind", "m/s", measured, np.concatenate(still), held_out=True, source=source),
+        score("speed, own wind free", "m/s", measured, free, held_out=True, source=source),
+        score("speed, no wind", "m/s", measured, still, held_out=True, source=source),
     ]
+
+
+# --- runs ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Coast:
+    """The part of a run in which the vehicle rolls, in spans.
+
+    time: ends of the spans [s], shape (n + 1,); speed: there [m/s]. direction: +1 or -1 along the track.
+    """
+
+    name: str
+    time: Array
+    speed: Array
+    direction: int
+    mass: float  # kg, all
+    temperature: float  # degC
+    altitude: float  # m
+
+    @property
+    def middle(self) -> Array:
+        """Mean speed of the spans [m/s]."""
+        return (self.speed[1:] + self.speed[:-1]) / 2
+
+    @property
+    def slowing(self) -> Array:
+        """Deceleration over the spans [m/s²]."""
+        return np.asarray(-np.diff(self.speed) / np.diff(self.time))
+
+
+def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Recording:
+    """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
+
+    facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or
+    ``down``, or any two words), ``rider_mass_kg`` or ``total_mass_kg``, and ``ambient_C`` if there is no column
+    ambient_temperature. Raises InputError naming file, line and column.
+    """
+    time = table["time"]
+    again = np.flatnonzero(np.diff(time) <= 0)
+    if len(again):
+        raise table.error(f"time: {time[again[0] + 1]:g} s does not increase", int(again[0]) + 1)
+    if "motor_speed" not in table and "vehicle_speed" not in table:
+        table["speed"]  # which is missing, or of no use
+    name = table.file.name.removesuffix(".gz").rpartition(".")[0]
+    notes = table.file.parent / "rides.json"
+    known = dict(read_facts(notes).get(name, {}) if facts is None else facts)
+    for keys in (("direction",), ("total_mass_kg", "rider_mass_kg")):
+        if not known.keys() & set(keys):
+            close = nearest(keys[0], [str(key) for key in known])
+            raise table.error(f"{notes.name} beside it says no {' or '.join(keys)} of {name!r}{close}")
+    if "ambient_temperature" not in table and "ambient_C" not in known:
+        raise table.error(f"no column ambient_temperature, and {notes.name} beside it says no ambient_C of {name!r}")
+    return Recording(name, {role: (time, table[column]) for column, role in _ROLES.items() if column in table}, known)
+
+
+def coast(run: Recording, vehicle: Vehicle, direction: int) -> Coast:
+    """The longest coasting of `run`: throttle closed, no brake, no current, down to a walk.
+
+    Raises InputError for a run that has no speed, is too short, in which the motor drives or the speed rises.
+    """
+    p, c = vehicle.parameters, COASTDOWN
+    columns = true_columns(run.columns, p)
+    role, factor = speed_role(run.name, columns, p)
+    time, speed = columns[role][0], columns[role][1] * factor
+    rolling = np.ones(len(time), dtype=bool)
+    for switch, limit in (("throttle", c.closed), ("brake_switch", 0.5)):
+        if switch in run.columns:
+            rolling &= np.interp(time, *run.columns[switch]) < limit
+    switched = "throttle" in run.columns or "brake_switch" in run.columns
+    first, last = _longest(rolling, time)
+    settle = 0.5 if switched else 0.0  # s, until the current has died away
+    keep = slice(int(np.searchsorted(time, time[first] + settle)), last)
+    time, speed = time[keep], speed[keep]
+    if not switched and len(speed):  # nothing but speed: from its greatest on
+        time, speed = time[int(np.argmax(speed)) :], speed[int(np.argmax(speed)) :]
+    slow = np.flatnonzero(speed < c.slowest)
+    until = int(slow[0]) if len(slow) else len(speed)
+    time, speed = time[:until], speed[:until]
+    lasts, falls = (float(x[-1] - x[0]) if len(x) > 1 else 0.0 for x in (time, -speed))
+    if lasts < c.shortest or -c.rising < falls < c.least_fall:
+        raise InputError(
+            f"{run.name}: too short a coast-down: {lasts:.1f} s in which the speed falls by {falls:.1f} m/s; at least "
+            f"{c.shortest:g} s and {c.least_fall:g} m/s are needed (throttle below {c.closed:.0%}, no brake)"
+        )
+    _check_current(run, time, c.driving * p["motor_current_limit"])
+    _check_falling(run, time, speed)
+    ends = time[0] + c.span * np.arange(max(int(lasts / c.span), 1) + 1)
+    mass = run.facts.get("total_mass_kg")
+    if not isinstance(mass, int | float):
+        mass = p["vehicle_mass"] + (run.rider_mass if run.rider_mass is not None else p["payload_mass"])
+    if "ambient_temperature" in run.columns:
+        temperature = float(run.columns["ambient_temperature"][1].mean())
+    elif isinstance(noted := run.facts.get("ambient_C"), int | float):
+        temperature = float(noted)
+    else:
+        raise InputError(
+            f"{run.name}: air temperature is neither measured nor noted (ambient_C): it gives the air density"
+        )
+    altitude = float(np.median(run.columns["gps_altitude"][1])) if "gps_altitude" in run.columns else 0.0
+    return Coast(run.name, ends, _at_ends(time, speed, ends), direction, float(mass), temperature, altitude)
+
+
+def _longest(rolling: Mask, time: Array) -> tuple[int, int]:
+    """The longest stretch of `rolling` as (first, end), blinks of a tenth of a second passed over."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], rolling, [False])).astype(int)))
+    starts, ends = edges[::2], edges[1::2]
+    if not len(starts):
+        return 0, 0
+    apart = time[starts[1:]] - time[ends[:-1] - 1] >= 0.1
+    starts, ends = starts[np.append(True, apart)], ends[np.append(apart, True)]
+    best = int(np.argmax(time[ends - 1] - time[starts]))
+    return int(starts[best]), int(ends[best])
+
+
+def _check_current(run: Recording, time: Array, driving: float) -> None:
+    """Refuse a run with a current beyond `driving` [A] over its median, the sensor's offset: the motor works."""
+    if "motor_current" not in run.columns:
+        return
+    t, current = run.columns["motor_current"]
+    inside = (t >= time[0]) & (t <= time[-1])
+    if inside.sum() < 10:
+        return
+    offset, span = float(np.median(current[inside])), COASTDOWN.span
+    means = np.array([x.mean() for x in np.array_split(current[inside], max(int((time[-1] - time[0]) / span), 1))])
+    worst = float(means[int(np.argmax(np.abs(means)))])
+    if abs(offset) > driving or abs(worst) > driving:
+        raise InputError(
+            f"{run.name}: the motor {'drives' if worst > 0 else 'brakes'} while it should coast: "
+            f"{worst:.1f} A in mean over {span:g} s, {offset:.1f} A in all; at most {driving:.2g} A"
+        )
+
+
+def _check_falling(run: Recording, time: Array, speed: Array) -> None:
+    """Refuse a run whose mean speed rises from one `rise_time` to the next by more than its noise explains."""
+    step = COASTDOWN.rise_time
+    means, sds = [], []
+    for begin in time[0] + step * np.arange(max(int((time[-1] - time[0]) / step), 1)):
+        inside = (time >= begin) & (time < begin + step)
+        x, y = time[inside], speed[inside]
+        left = y - np.polyval(np.polyfit(x - begin, y, 1), x - begin) if len(x) > 2 else np.zeros(1)
+        means.append(float(y.mean()) if len(y) else float("nan"))
+        sds.append(float(np.sqrt(left @ left) / max(len(x) - 2, 1)))
+    rises = np.diff(means) - 3 * np.hypot(sds[1:], sds[:-1])
+    if len(rises) and np.nanmax(rises) > COASTDOWN.rising:
+        i = int(np.nanargmax(rises))
+        begin = time[0] + i * step - min(t[0] for t, _ in run.columns.values())
+        raise InputError(
+            f"{run.name}: the speed rises from {means[i]:.2f} to {means[i + 1]:.2f} m/s between {begin:.0f} and "
+            f"{begin + 2 * step:.0f} s: the motor drives, or the track falls too steeply"
+        )
+
+
+def _at_ends(time: Array, speed: Array, ends: Array) -> Array:
+    """The speed at `ends`: a straight line through the samples within a quarter of a second around each."""
+    result = np.interp(ends, time, speed)
+    for i, at in enumerate(ends):
+        a, b = np.searchsorted(time, [at - 0.25, at + 0.25])
+        if b - a >= 4:
+            x, y = time[a:b] - at, speed[a:b]
+            spread = x - x.mean()
+            result[i] = y.mean() - x.mean() * float(spread @ y) / float(spread @ spread)
+    return result
+
+
+def directions(runs: Sequence[Recording]) -> list[int]:
+    """+1 or -1 for each run: as noted (``direction``; the first alphabetically but ``up`` is +1), else by GPS course.
+
+    Raises InputError if there is neither.
+    """
+    noted = [run.facts.get("direction") for run in runs]
+    if all(isinstance(word, str) for word in noted):
+        words = sorted({str(word) for word in noted}, key=lambda word: (word != "up", word))
+        if len(words) > 2:
+            raise InputError(f"coast-downs in {len(words)} directions: {', '.join(words)}; a track has two")
+        return [1 if word == words[0] else -1 for word in noted]
+    courses = []
+    for run in runs:
+        if "gps_course" not in run.columns:
+            raise InputError(f"{run.name}: its direction is neither noted (direction) nor told by a gps_course")
+        course = run.columns["gps_course"][1]
+        courses.append(complex(np.cos(course).mean(), np.sin(course).mean()))
+    return [1 if (c * courses[0].conjugate()).real > 0 else -1 for c in courses]
+
+
+# --- road load -----------------------------------------------------------------------------------------------------
+
+
+class RoadLoad:
+    """What holds a coasting vehicle back, by the effects of its own model."""
+
+    def __init__(self, vehicle: Vehicle, values: Mapping[str, float] | None = None, heavier: float = 0.0) -> None:
+        """values: in place of the vehicle's own. heavier [kg]: than the run says."""
+        p = dict(vehicle.parameters) | dict(values or {})
+        self.p, self.heavier = p, heavier
+        effects = [Bound(effect, p) for effect in vehicle.model.effects]
+        self._road = [e for e in effects if e.effect.port in ROAD_LOAD and "acceleration" not in e.effect.reads]
+        self._motor = [e for e in effects if e.effect.port is Port.MOTOR_LOSS]
+        self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
+        self.rotating = rotating_mass(p)
+
+    def __call__(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
+        """Force [N] at `speed` [m/s] (above zero). slope: sine, uphill in direction +1. wind [m/s]: against it.
+
+        density: factor on the air's density.
+        """
+        q = all_quantities(  # straight on, no current
+            speed=speed,
+            grade=run.direction * slope,
+            mass=run.mass + self.heavier,
+            air_density=density * air_density(run.temperature, run.altitude),
+            headwind=wind,
+            motor_speed=speed / road_speed(1.0, self.p),
+            motor_temperature=run.temperature,
+            ambient_temperature=run.temperature,
+            vibration=self._vibration,
+        )
+        return total(self._road, q) + total(self._motor, q) / speed
+
+    def slowing(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
+        """Deceleration [m/s²]."""
+        return self(speed, run, slope, wind, density) / (run.mass + self.heavier + self.rotating)
+
+
+def roll(force: RoadLoad, run: Coast, slope: float, wind: float) -> Array:
+    """Speed [m/s] at the run's times from its first speed on: Runge-Kutta of fourth order; zero after standstill."""
+    speed = np.empty(len(run.time))
+    speed[0] = v = float(run.speed[0])
+    for i, dt in enumerate(np.diff(run.time).tolist()):
+        if v > 0.05:
+            k1 = force.slowing(v, run, slope, wind)
+            k2 = force.slowing(max(v - dt / 2 * k1, 1e-3), run, slope, wind)
+            k3 = force.slowing(max(v - dt / 2 * k2, 1e-3), run, slope, wind)
+            k4 = force.slowing(max(v - dt * k3, 1e-3), run, slope, wind)
+            v = max(v - dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), 0.0)
+        speed[i + 1] = v
+    return speed
+
+
+def own_wind(force: RoadLoad, run: Coast, slope: float) -> float:
+    """The constant headwind [m/s] with which `run` is followed best."""
+    best = minimize_scalar(
+        lambda wind: float(np.sum((roll(force, run, slope, wind) - run.speed) ** 2)),
+        bounds=(-COASTDOWN.strongest_wind, COASTDOWN.strongest_wind),
+        method="bounded",
+        options={"xatol": 0.01},
+    )
+    return float(best.x)
+
+
+# --- the fit -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CoastdownNoise:
+    """What no parameter explains: speed noise at the ends of a span [m/s]; gusts [m/s], lasting [s]."""
+
+    speed: float = 0.02
+    gust: float = 0.5
+    lasting: float = 5.0
+
+
+@dataclass(frozen=True)
+class RoadFit:
+    """A fit of all runs. value: of all `NAMES`, those `held` too, of ``slope`` and of each run's ``wind NAME``."""
+
+    solution: Solution
+    noise: CoastdownNoise
+    held: dict[str, float]
+    value: dict[str, float]
+
+
+@dataclass(frozen=True)
+class RoadFitter:
+    """Fits the road load to runs: Gauss-Newton in the parameters, maximum likelihood in the noise."""
+
+    runs: Sequence[Coast]
+    vehicle: Vehicle
+    wind_sd: float
+    slope_sd: float
+
+    def fit(
+        self, held: Mapping[str, float], noise: CoastdownNoise | None = None, start: RoadFit | None = None
+    ) -> RoadFit:
+        """All runs at once, without the parameters `held`. noise: known; start: from there in one step."""
+        winds = [f"wind {run.name}" for run in self.runs]
+        names = [*(name for name in NAMES if name not in held), "slope", *winds]
+        prior = {"slope": (0.0, self.slope_sd), **dict.fromkeys(winds, (0.0, self.wind_sd))}
+        if "rolling_resistance_speed" in names:
+            prior["rolling_resistance_speed"] = (0.0, COASTDOWN.speed_sd)
+        value = START | dict.fromkeys(("slope", *winds), 0.0) | (start.value if start else {}) | dict(held)
+        now, solution = noise or CoastdownNoise(), None
+        for step in range(1 if start else 4):
+            blocks = self._linearised(value, names, now.gust)
+            centre = np.array([value[name] for name in names])
+            if noise is None and step == 1:
+                now = self._likely(blocks, value["drag_area"], names, centre, prior)
+            whole = np.vstack([white for _, white in self._whitened(blocks, value["drag_area"], now)])
+            target = whole[:, -1] + whole[:, :-1] @ centre  # such that the solution is the whole value
+            solution = linear({name: whole[:, i] for i, name in enumerate(names)}, target, 1.0, prior=prior)
+            value |= {name: solution[name] for name in names}
+        assert solution
+        return RoadFit(solution, now, dict(held), value)
+
+    def _linearised(self, value: Mapping[str, float], names: Sequence[str], gust: float) -> list[Array]:
+        """The deceleration of each run about `value`: its derivatives by `names`, and last measured less modelled.
+
+        Gusts of `gust` [m/s] add their mean square to that of the flow.
+        """
+        base = {name: value[name] for name in NAMES}
+        here = RoadLoad(self.vehicle, base)
+        moved = {n: RoadLoad(self.vehicle, base | {n: value[n] + _STEP[n]}) for n in names if n in NAMES}
+        blocks = []
+        for run in self.runs:
+            v, slope, wind = run.middle, value["slope"], value[f"wind {run.name}"]
+            now = here.slowing(v, run, slope, wind)
+            gusty = 0.5 * air_density(run.temperature, run.altitude) * value["drag_area"] * gust**2 / run.mass
+            columns = []
+            for name in names:
+                column: Any = 0.0
+                if name in NAMES:
+                    column = (moved[name].slowing(v, run, slope, wind) - now) / _STEP[name]
+                elif name == "slope":
+                    column = (here.slowing(v, run, slope + _STEP["slope"], wind) - now) / _STEP["slope"]
+                elif name == f"wind {run.name}":
+                    up, down = (here.slowing(v, run, slope, wind + step) for step in (1e-3, -1e-3))
+                    column = (up - down) / 2e-3
+                columns.append(np.broadcast_to(column, v.shape))
+            blocks.append(np.column_stack([*columns, run.slowing - now - gusty]))
+        return blocks
+
+    def _whitened(
+        self, blocks: Sequence[Array], drag_area: float, noise: CoastdownNoise
+    ) -> Iterator[tuple[float, Array]]:
+        """Of each run the ln of the determinant of its covariance, and its block in units of independent noise of 1.
+
+        The covariance of the deceleration of the spans: gusts that last, and speed noise that neighbours share.
+        """
+        for run, block in zip(self.runs, blocks, strict=True):
+            n, at = len(run.middle), (run.time[1:] + run.time[:-1]) / 2
+            push = air_density(run.temperature, run.altitude) * max(drag_area, 0.02) * run.middle / run.mass
+            gusts = np.outer(push, push) * noise.gust**2 * np.exp(-np.abs(at[:, None] - at[None, :]) / noise.lasting)
+            ends = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+            covariance = gusts + (noise.speed / COASTDOWN.span) ** 2 * ends + 1e-10 * np.eye(n)
+            root = cholesky(covariance, lower=True, check_finite=False)
+            yield 2 * float(np.log(np.diag(root)).sum()), solve_triangular(root, block, lower=True, check_finite=False)
+
+    def _likely(
+        self,
+        blocks: Sequence[Array],
+        drag_area: float,
+        names: Sequence[str],
+        centre: Array,
+        prior: Mapping[str, tuple[float, float]],
+    ) -> CoastdownNoise:
+        """The noise of greatest restricted likelihood (REML: Patterson & Thompson 1971), the parameters marginal."""
+        precision, pull = np.zeros((2, len(centre)))
+        for name, (mean, sd) in prior.items():
+            precision[names.index(name)], pull[names.index(name)] = sd**-2, mean
+        start = CoastdownNoise()
+
+        def minus_log(x: Array) -> float:
+            logs, normal, right, square = 0.0, np.diag(precision).copy(), precision * (pull - centre), 0.0
+            for log_determinant, white in self._whitened(blocks, drag_area, CoastdownNoise(*np.exp(x).tolist())):
+                a, y = white[:, :-1], white[:, -1]
+                logs += log_determinant
+                normal += a.T @ a
+                right = right + a.T @ y
+                square += float(y @ y)
+            square += float(precision @ (pull - centre) ** 2)
+            logs += float(np.linalg.slogdet(normal)[1])
+            # Weak priors keep the noise where it can be: a few tenths of m/s of gusts for a few seconds.
+            weak = (x[1] - np.log(start.gust)) ** 2 / 4 + (x[2] - np.log(start.lasting)) ** 2 / 2
+            return float(logs + square - float(right @ np.linalg.solve(normal, right)) + weak)
+
+        x0 = np.log([start.speed, start.gust, start.lasting])
+        best = minimize(minus_log, x0, method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.1, "maxiter": 120})
+        return CoastdownNoise(*np.exp(best.x).tolist())
+
+    def covariance(self, road: RoadFit, about: RoadFit) -> tuple[Array, dict[str, float]]:
+        """(covariance of `NAMES` with what else is not known well; the share of each of these in the sd of drag area).
+
+        Mass, inertia, radius, the motor's own drag and air density are taken as given in the fit. What they shift, were
+        they one sd off, is added: -(X'X)⁻¹·X'·D, with D the derivative of the deceleration by them, about `about`.
+        """
+        p, value, solution = self.vehicle.parameters, about.value, road.solution
+        base = {name: value[name] for name in NAMES}
+        effects = [e for e in self.vehicle.model.effects if e.port is Port.MOTOR_LOSS]
+        given = [
+            "wheel_inertia_front",
+            "wheel_inertia_rear",
+            "wheel_radius",
+            *(n for e in effects for n in e.term.parameters),
+        ]
+        given = [name for name in dict.fromkeys(given) if p.sd(name) > 0]
+        here = RoadLoad(self.vehicle, base)
+        heavier = sqrt(p.sd("vehicle_mass") ** 2 + COASTDOWN.entered_mass_sd**2)
+        # Force, factor on the air's density, factor on the deceleration: a larger wheel has been faster.
+        moved = [
+            (
+                RoadLoad(self.vehicle, base | {n: p[n] + p.sd(n)}),
+                1.0,
+                1 + (p.sd(n) / p[n] if n == "wheel_radius" else 0),
+            )
+            for n in given
+        ]
+        moved += [(RoadLoad(self.vehicle, base, heavier), 1.0, 1.0), (here, 1 + COASTDOWN.density_sd, 1.0)]
+        rows = []
+        for run, block in zip(self.runs, self._linearised(value, solution.names, road.noise.gust), strict=True):
+            at = run.middle, run, value["slope"], value[f"wind {run.name}"]
+            now = here.slowing(*at)
+            moves = [force.slowing(*at, density) - now * scale for force, density, scale in moved]
+            rows.append(np.column_stack([block, *moves]))
+        white = np.vstack([white for _, white in self._whitened(rows, value["drag_area"], road.noise)])
+        x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
+        shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
+        tied, matrix = correlations(self.vehicle), np.eye(len(moved))
+        for (i, a), (j, b) in permutations(enumerate(given), 2):
+            matrix[i, j] = tied.get(frozenset((a, b)), 0.0)
+        index = [solution.names.index(name) for name in NAMES]
+        covariance = solution.part(NAMES) + (shift @ matrix @ shift.T)[np.ix_(index, index)]
+        shares = zip([*given, "mass", "air density"], shift[index[-1]].tolist(), strict=True)
+        return covariance, dict(shares)
+
+
+def _fitted(fit: RoadFitter, result: Result) -> tuple[RoadFit, Array, dict[str, float]]:
+    """(the fit, covariance of `NAMES`, shares of what was taken as given in the sd of drag area).
+
+    Rolling resistance is held independent of speed, with a refusal, where that cannot be separated from drag.
+    """
+    free = fit.fit({})
+    covariance, shares = fit.covariance(free, free)
+    drag = free.value["drag_area"]
+    if free.value[NAMES[1]] >= 2 * sqrt(covariance[1, 1]) and drag > 0:
+        return free, covariance, shares
+    best = fit.fit({NAMES[1]: 0.0}, free.noise)
+    wide = fit.fit({}, free.noise, best)
+    covariance, shares = fit.covariance(wide, best)
+    speed_term, speed_sd = wide.value[NAMES[1]], sqrt(covariance[1, 1])
+    tie = covariance[:, 1] / covariance[1, 1]
+    # About the value that is held, not about the most likely one: its distance counts as an error too.
+    covariance = covariance + np.outer(tie, tie) * speed_term**2
+    why = "zero (less than 2 sd)" if drag > 0 else f"drag, whose area would be {drag:.2f} m² beside it"
+    result.refusals.append(
+        f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m is indistinguishable from "
+        f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"
+    )
+    return best, covariance, shares

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.calibration import auxiliary, cell, cooling, losses, motor, offsets, pulse, resistance, wheel
-from gz_onboard.calibration import coastdown as coasting
-from gz_onboard.calibration.coastdown_run import samples as coastdown_samples
+from gz_onboard.calibration import cell, coastdown, cooling, motor, pulse, sensors
 from gz_onboard.calibration.manifest import Option, Slot
 from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
@@ -37,11 +35,6 @@ class Given:
         assert isinstance(value, float | int)
         return float(value)
 
-    def one(self, slot: str) -> Measurements | None:
-        """The one table of a slot that may be left out."""
-        tables = self.tables.get(slot)
-        return tables[0] if tables else None
-
 
 @dataclass(frozen=True)
 class Procedure:
@@ -58,22 +51,16 @@ def _ocv(given: Given) -> Result:
 
 
 def _motor(given: Given) -> Result:
-    result = Result("motor")
-    if ramp := given.one("emf"):
-        result.add(motor.voltage_constant(ramp))
-    (dyno,) = given.tables["data"]
-    result.add(motor.torque_constant(dyno, given.one("warming"), given.number("largest_current")))
+    (dyno,), ramp = given.tables["data"], given.tables.get("emf")
+    result = motor.voltage_constant(ramp[0]) if ramp else Result("motor")
+    result.add(motor.torque_constant(dyno, given.number("largest_current")))
     return result
 
 
 def _losses(given: Given) -> Result:
     (dyno,) = given.tables["data"]
-    result = Result("losses")
-    result.add(losses.motor_losses(dyno, given.number("largest_current")))
-    result.add(losses.inverter_losses(dyno, given.number("largest_current")))
-    copper = "motor_copper_temperature_coefficient"
-    if any(refusal.startswith(copper) for refusal in result.refusals):
-        del result.parameters[copper]  # not measured: what the base file says stays
+    result = motor.motor_losses(dyno, given.number("largest_current"))
+    result.add(motor.inverter_losses(dyno, given.number("largest_current")))
     return result
 
 
@@ -111,23 +98,8 @@ def _load(ride: Recording) -> Array:
     return np.asarray(np.interp(seconds + 0.5, at, current))
 
 
-def _resistance(given: Given) -> Result:
-    rides, needed = given.rides["data"], set(offsets.NEEDED.split())
-    result = Result("resistance")
-    if with_inverter := [ride for ride in rides if needed <= ride.columns.keys()]:
-        result.add(resistance.cable_resistance(with_inverter, given.vehicle))
-    else:
-        lacking = sorted(needed.difference(*(ride.columns for ride in rides)))
-        result.refusals.append(
-            f"cable_resistance: needs {', '.join(lacking)}, which no ride has; the value of the file stays"
-        )
-    result.add(resistance.pack_series_resistance(given.rides["data"], given.vehicle, given.tables.get("pulses", [])))
-    return result
-
-
 def _cooling(given: Given) -> Result:
-    runs, validation = _cooling_runs(given, "data"), _cooling_runs(given, "held_out")
-    return cooling.calibrate_cooling(runs, given.vehicle, validation)
+    return cooling.calibrate_cooling(_cooling_runs(given, "data"), given.vehicle, _cooling_runs(given, "held_out"))
 
 
 def _cooling_runs(given: Given, slot: str) -> list[cooling.CoolingRun]:
@@ -142,8 +114,10 @@ def _cooling_runs(given: Given, slot: str) -> list[cooling.CoolingRun]:
 
 
 def _coastdown(given: Given) -> Result:
-    runs = given.rides.get("data", []) + [coastdown_samples(table) for table in given.tables.get("data", [])]
-    return coasting.calibrate(runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd"))
+    runs = given.rides.get("data", []) + [coastdown.samples(table) for table in given.tables.get("data", [])]
+    return coastdown.coast_downs(
+        runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd")
+    )
 
 
 _LARGEST: dict[str, Option] = {"largest_current": motor.RIDING_CURRENT}
@@ -153,14 +127,13 @@ PROCEDURES: dict[str, Procedure] = {
     "wheel": Procedure(
         "rolling radius of the driven wheel from GPS speed over motor speed",
         {"data": Slot("ride", "rides with GPS", 1)},
-        lambda given: wheel.calibrate(given.rides["data"], given.vehicle),
+        lambda given: sensors.wheel_radius(given.rides["data"], given.vehicle),
     ),
     "motor": Procedure(
         "constants of the motor from a dynamometer: back-EMF over speed, torque over current",
         {
             "data": Slot("table", "steady points of a motor dynamometer", 1, 1),
             "emf": Slot("table", "back-EMF over speed at no torque", 0, 1),
-            "warming": Slot("table", "a run at constant current in which the motor warms up", 0, 1),
         },
         _motor,
         _LARGEST,
@@ -188,12 +161,12 @@ PROCEDURES: dict[str, Procedure] = {
     "auxiliary": Procedure(
         "power of lamps, dashboard and control",
         {"data": Slot("ride", "rides with auxiliary current, or standing still with pack current", 1)},
-        lambda given: auxiliary.auxiliary_power(_true(given, "data"), given.vehicle),
+        lambda given: sensors.auxiliary_power(_true(given, "data"), given.vehicle),
     ),
     "offsets": Procedure(
         "offset, gain and noise of the pack's sensors",
         {"data": Slot("ride", "rides that begin or end at rest", 1)},
-        lambda given: offsets.offsets(given.rides["data"], given.vehicle),
+        lambda given: sensors.offsets(given.rides["data"], given.vehicle),
     ),
     "resistance": Procedure(
         "resistance of pack and cable beside the cells",
@@ -201,7 +174,7 @@ PROCEDURES: dict[str, Procedure] = {
             "data": Slot("ride", "rides, above 20 degC for the pack", 1),
             "pulses": Slot("table", "pulse tests of a cell, at two temperatures or more", 0),
         },
-        _resistance,
+        lambda given: sensors.resistances(given.rides["data"], given.vehicle, given.tables.get("pulses", [])),
     ),
     "cooling": Procedure(
         "the four cooling networks from warming up and cooling down, on a bench (tables) and on the vehicle (rides)",
@@ -213,6 +186,6 @@ PROCEDURES: dict[str, Procedure] = {
         "rolling resistance and drag area from coast-downs in both directions",
         {"data": Slot("any", "coast-downs in both directions: rides, or tables of time and speed", 2)},
         _coastdown,
-        {"wind_sd": coasting.WIND_SD, "slope_sd": coasting.SLOPE_SD},
+        {"wind_sd": coastdown.COASTDOWN.wind_sd, "slope_sd": coastdown.COASTDOWN.slope_sd},
     ),
 }

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.auxiliary import auxiliary_power
+from gz_onboard.calibration.sensors import auxiliary_power
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import read_vehicle
 

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.coastdown import calibrate
-from gz_onboard.calibration.coastdown_run import coast, directions, samples
-from gz_onboard.calibration.road_load import NAMES
+from gz_onboard.calibration.coastdown import NAMES, coast, coast_downs, directions, samples
 from gz_onboard.calibration.table import Measurements, read_table
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
@@ -95,7 +93,7 @@ def plant(seed, trials=1, runs=6, **fixed):
 def test_intervals_hold_the_truth():
     away = []
     for runs, truth in plant(1, trials=100):
-        found = calibrate(runs, VEHICLE, hold_out=False).parameters
+        found = coast_downs(runs, VEHICLE, hold_out=False).parameters
         away.append([(found[name].value - truth[name]) / found[name].sd for name in NAMES])
     held = dict(zip(NAMES, np.mean(np.abs(away) < 1.96, axis=0), strict=True))
     for name in NAMES:
@@ -108,7 +106,7 @@ def healthy():
 
 
 def test_left_out_pairs_are_followed(healthy):
-    found = calibrate(healthy[0], VEHICLE)
+    found = coast_downs(healthy[0], VEHICLE)
     own, still = (fit for fit in found.fits if fit.held_out)
     assert own.largest < still.largest < 2.0  # m/s: the thesis' figure
     assert own.rms < 0.2
@@ -116,7 +114,7 @@ def test_left_out_pairs_are_followed(healthy):
 
 
 def test_covariance_is_that_of_the_values(healthy):
-    found = calibrate(healthy[0], VEHICLE, hold_out=False)
+    found = coast_downs(healthy[0], VEHICLE, hold_out=False)
     ((names, covariance),) = found.covariance
     assert names == NAMES
     assert np.allclose(np.sqrt(np.diag(covariance)), [found.parameters[name].sd for name in NAMES])
@@ -125,7 +123,7 @@ def test_covariance_is_that_of_the_values(healthy):
 
 
 def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
-    every = [calibrate(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
+    every = [coast_downs(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
     refused = [found for found in every if found.parameters["rolling_resistance_speed"].value == 0]
     assert len(refused) >= 5  # it is given from 2 sd on: by chance of one in forty
     assert all("indistinguishable from zero" in found.refusals[0] for found in refused)
@@ -133,7 +131,7 @@ def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
 
 
 def test_a_speed_term_that_shows_is_given():
-    found = calibrate(plant(3, rolling_resistance_speed=1.5e-3)[0][0], VEHICLE, hold_out=False)
+    found = coast_downs(plant(3, rolling_resistance_speed=1.5e-3)[0][0], VEHICLE, hold_out=False)
     speed = found.parameters["rolling_resistance_speed"]
     assert not found.refusals
     assert abs(speed.value - 1.5e-3) < 2.5 * speed.sd
@@ -141,7 +139,7 @@ def test_a_speed_term_that_shows_is_given():
 
 def test_one_direction_leaves_slope_and_rolling_resistance_together(healthy):
     runs, truth = healthy
-    found = calibrate(runs[::2], VEHICLE, hold_out=False)
+    found = coast_downs(runs[::2], VEHICLE, hold_out=False)
     assert "rolling_resistance_constant" not in found.parameters
     assert any("all runs go one way (up)" in text and "± 0.01" in text for text in found.refusals)
     drag = found.parameters["drag_area"]
@@ -156,23 +154,23 @@ def test_refused_runs(healthy):
     runs = list(healthy[0])
     time, speed = runs[0].columns["motor_speed"]
     with pytest.raises(InputError, match=r"run_0: too short a coast-down: 7\.\d s"):
-        calibrate([changed(runs[0], motor_speed=(time[:80], speed[:80])), *runs[1:]], VEHICLE)
+        coast_downs([changed(runs[0], motor_speed=(time[:80], speed[:80])), *runs[1:]], VEHICLE)
     rising = speed + 12 * np.exp(-(((time - 40) / 4) ** 2))
     with pytest.raises(InputError, match="run_0: the speed rises from"):
-        calibrate([changed(runs[0], motor_speed=(time, rising)), *runs[1:]], VEHICLE)
+        coast_downs([changed(runs[0], motor_speed=(time, rising)), *runs[1:]], VEHICLE)
     driving = np.where((time > 20) & (time < 24), 9.0, -0.3)
     with pytest.raises(InputError, match=r"run_0: the motor drives while it should coast: 9\.0 A"):
-        calibrate([changed(runs[0], motor_current=(time, driving)), *runs[1:]], VEHICLE)
+        coast_downs([changed(runs[0], motor_current=(time, driving)), *runs[1:]], VEHICLE)
     with pytest.raises(InputError, match="at least 2"):
-        calibrate(runs[:1], VEHICLE)
+        coast_downs(runs[:1], VEHICLE)
     with pytest.raises(InputError, match="given twice"):
-        calibrate([runs[0], runs[0]], VEHICLE)
+        coast_downs([runs[0], runs[0]], VEHICLE)
     columns = {role: values for role, values in runs[0].columns.items() if role != "motor_speed"}
     with pytest.raises(InputError, match="has no speed"):
-        calibrate([replace(runs[0], columns=columns), runs[1]], VEHICLE)
+        coast_downs([replace(runs[0], columns=columns), runs[1]], VEHICLE)
     cold = {role: values for role, values in runs[0].columns.items() if role != "ambient_temperature"}
     with pytest.raises(InputError, match="ambient_C"):
-        calibrate([replace(runs[0], columns=cold), runs[1]], VEHICLE)
+        coast_downs([replace(runs[0], columns=cold), runs[1]], VEHICLE)
     with pytest.raises(InputError, match="neither noted"):
         directions([replace(run, facts={}) for run in runs])
     odd = [replace(run, facts={"direction": word}) for run, word in zip(runs, "abc", strict=False)]
@@ -194,7 +192,7 @@ def test_commissioning_coastdowns():
     logs = sorted(Path(DATA or "").rglob("commissioning/coastdown_*.blf"))
     if not logs:
         pytest.skip("no coast-downs in GZ_ONBOARD_DATA")
-    found = calibrate([read_recording(log, VEHICLE) for log in logs], VEHICLE)
+    found = coast_downs([read_recording(log, VEHICLE) for log in logs], VEHICLE)
     own, still = (fit for fit in found.fits if fit.held_out)
     assert own.largest < 0.3
     assert still.largest < 1.2
@@ -272,7 +270,7 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
                 "name": run.name,
                 "direction": run.facts["direction"],
                 "ambient_C": rolling.temperature,
-                "rider_mass_kg": rolling.payload,
+                "rider_mass_kg": run.rider_mass,
             }
         )
     (tmp_path / "rides.json").write_text(json.dumps(notes))
@@ -280,7 +278,7 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
     files = [str(tmp_path / f"{run.name}.csv") for run in runs]
     assert main(["calibrate", "coastdown", *files, "--json", str(answer)]) == 0
     (found,) = json.loads(answer.read_text())["procedures"]
-    same = calibrate(runs, VEHICLE, hold_out=False)
+    same = coast_downs(runs, VEHICLE, hold_out=False)
     for name in ("rolling_resistance_constant", "drag_area"):
         value = found["parameters"][name]["value"]
         # A table begins at its greatest speed, a ride where the throttle closes.
@@ -317,7 +315,7 @@ def test_speeds_alone_give_wide_intervals():
         speed = np.loadtxt(folder / f"Michelin60{name}.csv") / 3.6
         table = Measurements(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
         runs.append(samples(table, {"direction": name[0], "total_mass_kg": 76.0, "ambient_C": 30.0}))
-    found = calibrate(runs, small_car(), hold_out=True)
+    found = coast_downs(runs, small_car(), hold_out=True)
     c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
     assert 0.001 < c0.value < 0.008
     assert area.sd > 0.1 * area.value

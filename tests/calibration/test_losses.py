@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.losses import TIED, inverter_losses, motor_losses
-from gz_onboard.calibration.motor import torque_constant
+from gz_onboard.calibration.motor import TIED, inverter_losses, motor_losses, torque_constant
 from gz_onboard.calibration.table import read_table
 from gz_onboard.errors import InputError
 

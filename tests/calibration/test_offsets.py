@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.auxiliary import CURRENT_SD
-from gz_onboard.calibration.offsets import DRIFT_SD, GAIN_SD, offsets, read_pair, window_means
 from gz_onboard.calibration.result import LackingError
+from gz_onboard.calibration.sensors import RIDE, offsets, read_pair
 from gz_onboard.errors import InputError
 
 from .rides import CURRENT_NOISE, GAIN, OFFSET, VEHICLE, VOLTAGE_NOISE, VOLTS_APART, ride
@@ -29,11 +28,11 @@ def test_intervals_hold_what_instruments_of_their_class_do():
     away = []
     for seed in range(0, 300, 3):
         errs = {
-            "inverter_gain": 1 + GAIN_SD * rng.normal(),
+            "inverter_gain": 1 + RIDE.gain_sd * rng.normal(),
             "own_loss": 1 + own_sd * rng.normal(),
-            "auxiliary_sign": 1 + CURRENT_SD * rng.normal(),
+            "auxiliary_sign": 1 + RIDE.shunt_sd * rng.normal(),
         }
-        *drifts, next_one = DRIFT_SD * rng.normal(size=4)  # the offset's sd is of a ride to come
+        *drifts, next_one = RIDE.drift_sd * rng.normal(size=4)  # the offset's sd is of a ride to come
         rides = [ride(seed + k, seconds=200, drift=drift, **errs) for k, drift in enumerate(drifts)]
         found = offsets(rides, VEHICLE).parameters
         truths = {"pack_current_gain": GAIN, "pack_current_offset": OFFSET + next_one}
@@ -80,7 +79,7 @@ def test_means_are_over_whole_windows():
     pair = read_pair(ride(0), VEHICLE)
     step = float(np.median(np.diff(pair.time)))
     count = round(2.0 / step)
-    means = window_means(pair, np.arange(len(pair.time), dtype=float), 2.0)
+    means = pair.means(np.arange(len(pair.time), dtype=float), 2.0)
     assert len(means) == len(pair.time) // count
     assert means[:2] == pytest.approx([(count - 1) / 2, (3 * count - 1) / 2])
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from gz_onboard.calibration.auxiliary import auxiliary_power
-from gz_onboard.calibration.offsets import offsets
 from gz_onboard.calibration.prior_check import check_against_file
-from gz_onboard.calibration.resistance import cable_resistance
 from gz_onboard.calibration.result import Found, Result
-from gz_onboard.calibration.wheel import calibrate as wheel
+from gz_onboard.calibration.sensors import auxiliary_power, cable_resistance, offsets
+from gz_onboard.calibration.sensors import wheel_radius as wheel
 from gz_onboard.errors import InputError
 
 from .rides import VEHICLE, ride

@@ -3,13 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.resistance import (
-    CELL_SHARE_SD,
-    VOLTAGE_GAIN_SD,
-    cable_resistance,
-    cell_steps,
-    pack_series_resistance,
-)
+from gz_onboard.calibration.sensors import RIDE, cable_resistance, cell_steps, pack_series_resistance
 from gz_onboard.errors import InputError
 
 from .bench import table
@@ -34,7 +28,7 @@ def test_cable_intervals_hold_voltage_sensors_of_their_class():
     """Over scooters whose two voltage sensors err in gain."""
     rng, held, count = np.random.default_rng(0), 0, 100
     for seed in range(count):
-        gains = tuple(1 + VOLTAGE_GAIN_SD * rng.normal(size=2))
+        gains = tuple(1 + RIDE.voltage_gain_sd * rng.normal(size=2))
         rides = [ride(3 * seed + k, seconds=200, voltage_gains=gains) for k in range(3)]
         found = cable_resistance(rides, VEHICLE).parameters["cable_resistance"]
         held += abs(found.value - CABLE) < 1.96 * found.sd
@@ -74,7 +68,7 @@ def test_series_intervals_hold_cells_that_differ():
     pulses, rng = [pulse(10.0, CELL_STEP), pulse(40.0, CELL_STEP)], np.random.default_rng(0)
     held, count = 0, 60
     for seed in range(count):
-        cell = CELL_STEP * (1 + CELL_SHARE_SD * rng.normal())
+        cell = CELL_STEP * (1 + RIDE.cells_sd * rng.normal())
         rides = [ride(3 * seed + k, seconds=200, cell=cell, series=2 * SERIES) for k in range(3)]
         found = pack_series_resistance(rides, VEHICLE, pulses).parameters["pack_series_resistance"]
         held += abs(found.value - 2 * SERIES) < 1.96 * found.sd

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.calibration.wheel import RECEIVER, calibrate
+from gz_onboard.calibration.sensors import RIDE, wheel_radius
 from gz_onboard.errors import InputError
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import read_vehicle
@@ -35,16 +35,16 @@ def ride(
 @settings(max_examples=10, deadline=None)
 @given(st.floats(0.2, 0.35), st.integers(0, 1000), st.floats(0, 0.6))
 def test_a_planted_radius_comes_back(radius, seed, lag):
-    found = calibrate([ride(radius, seed, lag, top=14.0), ride(radius, seed + 1, lag, top=14.0)], VEHICLE)
+    found = wheel_radius([ride(radius, seed, lag, top=14.0), ride(radius, seed + 1, lag, top=14.0)], VEHICLE)
     assert found.parameters["wheel_radius"].value == pytest.approx(radius, rel=0.002)
 
 
 def test_its_sd_holds_receivers_that_err():
     inside = 0
     for seed in range(60):
-        bias = float(np.random.default_rng(seed).normal(0, RECEIVER))  # one receiver on all rides
+        bias = float(np.random.default_rng(seed).normal(0, RIDE.receiver_sd))  # one receiver on all rides
         rides = [ride(0.24, 10 * seed + k, minutes=3, bias=bias) for k in range(3)]
-        found = calibrate(rides, VEHICLE).parameters["wheel_radius"]
+        found = wheel_radius(rides, VEHICLE).parameters["wheel_radius"]
         inside += abs(found.value - 0.24) < 1.96 * found.sd
     assert 0.9 <= inside / 60 <= 0.99
 
@@ -53,12 +53,12 @@ def test_what_does_not_tell_is_refused():
     good = ride(0.24, 1)
     blind = Recording("blind", {"motor_speed": good.columns["motor_speed"]})
     slow = ride(0.24, 2, top=4.0)
-    result = calibrate([good, blind, slow], VEHICLE)
+    result = wheel_radius([good, blind, slow], VEHICLE)
     assert result.refusals[0] == "blind: has no gps_speed or no motor_speed, nor a wheel_speed_rear instead"
     assert "ride_2: 0 fixes at steady speed" in result.refusals[1]
     assert "ride_1" in result.parameters["wheel_radius"].source
     with pytest.raises(InputError, match="no ride tells the wheel's radius: blind"):
-        calibrate([blind], VEHICLE)
+        wheel_radius([blind], VEHICLE)
 
 
 def test_without_a_motor_speed_it_is_that_of_the_rear_wheel_and_says_so():
@@ -66,7 +66,7 @@ def test_without_a_motor_speed_it_is_that_of_the_rear_wheel_and_says_so():
     time, turned = with_motor.columns["motor_speed"]
     columns = {"gps_speed": with_motor.columns["gps_speed"], "wheel_speed_rear": (time, turned)}
     geared = VEHICLE.changed(VEHICLE.parameters.replaced(gear_ratio=0.2))
-    result = calibrate([Recording("car", columns)], geared)
+    result = wheel_radius([Recording("car", columns)], geared)
     assert result.parameters["wheel_radius"].value == pytest.approx(0.24, rel=0.003)
     assert "car: no motor_speed, taken by wheel_speed_rear instead" in result.notes
     assert "gps_speed over wheel_speed_rear" in result.parameters["wheel_radius"].source

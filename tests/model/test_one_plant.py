@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.arrays import block_means
 from gz_onboard.calibration.circuit import Circuit, Reaction, voltage
-from gz_onboard.calibration.coastdown_run import Coast
+from gz_onboard.calibration.coastdown import Coast, RoadLoad
 from gz_onboard.calibration.cooling import ENTROPY, ENTROPY_SOC, CoolingRun, motor_temperatures, pack_temperatures
-from gz_onboard.calibration.road_load import RoadLoad
 from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.mixed_model import initial
@@ -320,7 +319,7 @@ def test_everyone_has_the_same_road_load(ride):
 def test_a_coast_down_is_held_back_as_the_model_says(speed, slope):
     """The road load of calibration, with the motor turning along, is what the light model drives against."""
     ends = np.array([0.0, 1.0])
-    run = Coast("run", ends, ends, 1, None, VEHICLE.model.mass, AMBIENT, 0.0)
+    run = Coast("run", ends, ends, 1, VEHICLE.model.mass, AMBIENT, 0.0)
     force = RoadLoad(VEHICLE)(speed, run, slope, 0.0)
     q = dict.fromkeys(QUANTITIES, 0.0) | {"speed": speed, "grade": slope, "grade_cosine": (1 - slope**2) ** 0.5}
     q |= {"mass": VEHICLE.model.mass, "air_density": air_density(AMBIENT), "motor_temperature": AMBIENT}
