@@ -55,12 +55,6 @@ def test_frames_are_those_of_the_command(tmp_path, capsys):
     assert len(repr(frames)) < 3000
 
 
-@pytest.mark.parametrize("end", [math.inf, 1e300])
-def test_what_has_no_end_goes_to_the_end(end):
-    last = gz.read_frames(COASTDOWN, start=40.0)
-    assert gz.read_frames(COASTDOWN, start=40.0, end=end).frames == last.frames != []
-
-
 @pytest.mark.parametrize("columns", [None, ["BMS_PackVoltage", "BMS_PackCurrent[A]", "INV_MotorSpeed"]])
 def test_signals_are_those_of_the_command(columns, tmp_path):
     only = ["--columns", ",".join(columns)] if columns else []
@@ -150,17 +144,6 @@ def test_a_check_is_that_of_the_command(tmp_path, capsys):
     assert [feature.works for feature in found.features] == [feature["works"] for feature in told["features"]]
     assert found.wrong == []
     assert len(repr(found)) < 3000
-
-
-def test_a_check_without_a_log_says_what_the_file_is_enough_for(capsys):
-    assert cli.main(["vehicle", "check", "reference"]) == 0
-    found = gz.check_vehicle("reference")
-    assert f"{found}\n" == capsys.readouterr().out.replace("\n\n", "\n")
-    assert [feature.name for feature in found.features if not feature.works] == [
-        "weakest group of cells",
-        "riders told apart",
-    ]
-    assert len(found.to_table()["role"]) == 0
 
 
 def test_signals_of_a_vehicle_are_found_by_parameter_group(tmp_path):

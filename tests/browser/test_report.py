@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import gz_onboard as gz
-from gz_onboard.api.estimates import EstimatedRide
+from gz_onboard.api import EstimatedRide
 from gz_onboard.cli import main
 from tests.support import LOGS
 
