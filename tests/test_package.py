@@ -212,7 +212,7 @@ def test_a_command_of_the_lab_says_what_to_install(board, tmp_path, command):
     given = arguments.get(command, [LOGS / "coastdown.blf"])
     told = run(board / "gz-onboard", command, *given, cwd=tmp_path, status=2)
     (line,) = told.stderr.splitlines()
-    said = rf"gz-onboard {command}: needs (scipy|matplotlib|pyarrow), which is not installed: {INSTALL}"
+    said = rf"gz-onboard {command}: needs (scipy|matplotlib|pyarrow|tomlkit), which is not installed: {INSTALL}"
     assert re.fullmatch(said, line)
     assert told.stdout == ""
     assert not list(tmp_path.iterdir())
