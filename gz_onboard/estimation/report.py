@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     check_page(out)
-    known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
+    known_vehicle(arguments.vehicle, arguments.payload)  # its errors concern every log
     given = arguments.vehicle, arguments.payload, False
     more = {"route": arguments.route, "located": not arguments.no_path}
     tasks = [ReportTask(log, Path(f"ride-{i}"), *given, **more) for i, log in enumerate(logs, 1)]
@@ -310,7 +310,7 @@ def _why(why: Why | None) -> str:
 
 
 def changed_by(change: Why) -> dict[str, float]:
-    """The causes of a change [km], in words; a sensor that is left out takes with it what it taught."""
+    """The causes of a change [km], in words; a sensor that is left out takes its teachings with it."""
     causes = {cause_words(name): km for name, km in change.causes_km.items()}
     if change.forgotten:
         left_out = " and ".join(map(words, change.forgotten))
@@ -328,5 +328,5 @@ def _changes(changes: Sequence[Why]) -> str:
         causes = ", ".join(f"{name} {km:+.1f}" for name, km in _largest(changed_by(change)))
         rows.append([clock(change.time_s), f"{change.range_km - change.reference_km:+.1f}", causes])
     more = f"; the last {MOST_CHANGES} of {len(changes)}" if len(changes) > MOST_CHANGES else ""
-    title = f"<h3>Changes of the range, in km, beyond what was ridden{more}</h3>"
+    title = f"<h3>Changes of the range, in km, beyond the distance ridden{more}</h3>"
     return f'{title}<div data-of="changes">{html_table(("at", "by", "why"), rows, (1,))}</div>'

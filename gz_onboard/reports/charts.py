@@ -170,7 +170,7 @@ def range_over_distance(rows: Sequence[Row]) -> Figure:
     lines, known = [forecast], np.flatnonzero(np.isfinite(forecast.y))
     if len(known) and not c.where("activity", Activity.CHARGING.name).any():
         end = np.array([0.0, ridden[known[-1]]])
-        lines.append(Line(forecast.y[known[-1]] + end[::-1], MUTED, "what it came to", style="--", x=end))
+        lines.append(Line(forecast.y[known[-1]] + end[::-1], MUTED, "as it came", style="--", x=end))
     figure = chart([[ChartPanel("range [km]", lines, 2.2, BLUE)]], ridden, "distance [km]", left=0.06)
     figure.axes[0].set_ylim(bottom=0)
     return figure

@@ -56,7 +56,7 @@ summary { cursor: pointer; padding: .3rem 0; font-weight: 600; } nav a { margin-
 WIDE_INCHES = 8.0
 """A wider figure is scrolled on a phone, or its texts could not be read."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""What a browser may fetch for the page: nothing."""
+"""A browser may fetch nothing for the page."""
 
 
 class Failed(str):
@@ -155,7 +155,7 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def write_below(file: Path, maker: str, text: str) -> None:
-    """Write Markdown. Where `file` says that the rest is made by `maker`, what is above it stays. Raises OSError."""
+    """Write Markdown. Text of `file` above the mark of `maker` stays. Raises OSError."""
     mark = mark_of(maker)
     before = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
     kept = f"{before.partition(mark)[0]}{mark}\n\n" if mark in before else ""

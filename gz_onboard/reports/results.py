@@ -88,7 +88,7 @@ def _optional(kind: Any) -> frozenset[str]:
 
 
 def distinct_names(logs: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """What the ride of each log is called: its name, with that of its folder or its file where several have the same.
+    """Distinct names for the rides of logs: with the name of the folder or the file where several are the same.
 
     InputError if that leaves two alike.
     """
@@ -123,7 +123,7 @@ def leap_text(when: float, leap: float) -> str:
     told = f"{years:.1f} years" if years >= 1 else f"{days:.0f} days" if days >= 2 else clock(by)
     told = told if by >= 9.5 else f"{by:.1f} s"
     way = "ahead" if leap > 0 else "back"
-    return f"the log's clock leaps {way} by {told} after {clock(when)}: taken as set then, and the ride goes on"
+    return f"the log's clock leaps {way} by {told} after {clock(when)}: taken as set then, and the ride continues"
 
 
 def number(value: float | None, form: str, unit: str = "", factor: float = 1.0) -> str:

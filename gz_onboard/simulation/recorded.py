@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import pi
+from math import nan, pi
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +31,23 @@ from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
 
-BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
-BRAKE_MEAN = 0.07835  # of full brake, 90 N: the mean of these rides while the switch is on, where no pressures are
-ROAD_PIECE = 5.0  # m
-SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
-SMOOTHED = 0.2  # s: over which the roller's speed at the ends of a span is a mean
-LEAST_HEADINGS = 10  # of a ride whose heading counts as known
-_MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
+
+@dataclass(frozen=True)
+class RecordedConfig:
+    """Settings of reading a recorded ride."""
+
+    road_piece_m: float = 5.0  # length of a piece of the road's tables
+    brake_pressed_pa: float = 0.5e5  # less is noise of the pressure sensors
+    brake_mean: float = 0.07835  # of full brake (90 N): mean of the repository's rides while the switch is on
+    turning_m_s: float = 2.0  # slower, yaw rate over speed is not a curvature, nor the heading known
+    least_headings: int = 10  # of a ride whose heading counts as known
+    roller_span_s: float = 2.0  # over which a roller's force and speed are averaged
+    roller_m_s: float = 1.0  # mean of a span in which the roller moves
+    roller_spans: int = 10  # at least, to fit four parameters
+    roller_smoothing_s: float = 0.2  # of the speed at the ends of a span
+
+
+CONFIG = RecordedConfig()
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,7 @@ class Recorded:
     """A recorded ride, at even steps.
 
     signals: by role, in its SI unit, arrays of one length; only recorded ones, corrected for known errors of the
-    vehicle's sensors (`physics.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
+    vehicle's sensors (`model.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
     of `brake_torque_limit`) and ``soc`` (counted charge) are worked out; ``vibration`` [m/s²] too, if the vehicle's
     model reads it and the ride tells it.
     """
@@ -53,7 +63,7 @@ class Recorded:
     name: str
     dt: float  # s
     signals: dict[str, Array]
-    grade: Array  # sine, each `ROAD_PIECE` of distance
+    grade: Array  # sine, each `road_piece_m` of distance
     curvature: Array  # 1/m, positive to the left, likewise
     heading: Array | None = None  # rad clockwise from north, likewise; None without GPS
     vibration: Array | None = None  # m/s², likewise; None where ``vibration`` is not known
@@ -95,7 +105,7 @@ class Recorded:
 
     def road(self, headwind: float = 0.0) -> RoadProfile:
         """The road that was ridden."""
-        starts = [ROAD_PIECE * i for i in range(len(self.grade))]
+        starts = [CONFIG.road_piece_m * i for i in range(len(self.grade))]
         return road_table(starts, self.grade.tolist(), self.curvature.tolist(), headwind)
 
 
@@ -107,37 +117,35 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
     columns = true_columns(read_recording(log, vehicle, progress).columns, vehicle.parameters)
-    rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
-    headings: list[tuple[float, float]] = []
-    rough: list[tuple[float, float, float]] = []  # time, distance, vibration
-    reads_vibration = "vibration" in vehicle.model.reads
+    rows: list[tuple[float, ...]] = []
+    reads_vibration = "vibration" in vehicle.model.reads and "accel_z" in columns
 
     def observe(estimate: Estimate) -> None:
         motion, speed = pipeline.estimator.motion, estimate.speed or 0.0
-        turning = (motion.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
-        rows.append((motion.distance, motion.grade or 0.0, turning))
-        if motion.heading is not None and speed > _MOVING:
-            headings.append((motion.distance, motion.heading))
-        if reads_vibration:
-            rough.append((estimate.time, motion.distance, pipeline.estimator.load.vibration(estimate.time)))
+        turning = speed > CONFIG.turning_m_s
+        curvature = (motion.yaw_rate or 0.0) / speed if turning else 0.0
+        heading = motion.heading if turning and motion.heading is not None else nan
+        rough = pipeline.estimator.load.vibration(estimate.time) if reads_vibration else nan
+        rows.append((estimate.time, motion.distance, motion.grade or 0.0, curvature, heading, rough))
 
     mapping, frames = open_ride(log, vehicle)
     pipeline = Pipeline(replace(vehicle, mapping=mapping), observer=observe)
     pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
     feed(pipeline, frames)
-    felt = np.array(rough) if rough and "accel_z" in columns else None
-    if felt is not None:
-        columns["vibration"] = felt[:, 0], felt[:, 2]
+    time, way, grade, curvature, heading, rough = np.array(rows).T
+    if reads_vibration:
+        columns["vibration"] = time, rough
     signals = _signals(log, columns, vehicle)
-    way, grade, curvature = (np.array(column) for column in zip(*rows, strict=True))
-    vibration = None if felt is None else _over_road(felt[:, 1], felt[:, 2])
-    heading = None
-    if len(headings) >= LEAST_HEADINGS:
-        course = np.array(headings)
-        heading = _over_road(course[:, 0], course[:, 1], period=2 * pi)
-    stood = way[0] == way[-1]
-    slope, bend = (np.zeros(1) if stood else _over_road(way, values) for values in (grade, curvature))
-    recorded = Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
+    known, stood = np.isfinite(heading), way[0] == way[-1]
+    recorded = Recorded(
+        name=ride_name(log),
+        dt=STEP,
+        signals=signals,
+        grade=np.zeros(1) if stood else _over_road(way, grade),
+        curvature=np.zeros(1) if stood else _over_road(way, curvature),
+        heading=_over_road(way[known], heading[known], 2 * pi) if known.sum() >= CONFIG.least_headings else None,
+        vibration=_over_road(way, rough) if reads_vibration else None,
+    )
     if "pack_voltage" in signals and "pack_current" in signals:
         signals["soc"] = _counted_soc(recorded, vehicle)
     return recorded
@@ -157,28 +165,30 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
     pressed = signals.get("brake_switch")
     if "brake_pressure_front" in signals and "brake_pressure_rear" in signals:
         pressure = signals["brake_pressure_front"] + signals["brake_pressure_rear"]
-        pressure = np.where(pressure > BRAKE_PRESSED, pressure, 0.0)
+        pressure = np.where(pressure > CONFIG.brake_pressed_pa, pressure, 0.0)
         if pressed is not None:
             pressure = np.where(pressed > 0.5, np.maximum(pressure, 1.0), 0.0)
         signals["brake"] = np.clip(pressure * vehicle.parameters["brake_force_per_pressure"] / limit, 0.0, 1.0)
     elif pressed is not None:
-        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN, 0.0)
+        signals["brake"] = np.where(pressed > 0.5, CONFIG.brake_mean, 0.0)
     return signals
 
 
 def _over_road(distance: Array, values: Array, period: float | None = None) -> Array:
-    """`values` (n,) at `distance` (n,) [m], each `ROAD_PIECE` of the way; where the scooter stood, as it came there.
+    """`values` (n,) at `distance` (n,) [m], each `road_piece_m` of the way; where the scooter stood, as it came there.
 
     period: of an angle, which then continues over a whole turn.
     """
     distance, keep = np.unique(distance, return_index=True)
     found = values[keep] if period is None else np.unwrap(values[keep], period=period)
-    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, found)
+    return np.interp(
+        np.arange(CONFIG.road_piece_m / 2, distance[-1] + CONFIG.road_piece_m, CONFIG.road_piece_m), distance, found
+    )
 
 
 def _at(table: Array, distance: float) -> float:
-    """What `table`, each `ROAD_PIECE`, has at `distance` [m]; beyond its ends the edge."""
-    return float(table[min(max(int(distance / ROAD_PIECE), 0), len(table) - 1)])
+    """What `table`, each `road_piece_m`, has at `distance` [m]; beyond its ends the edge."""
+    return float(table[min(max(int(distance / CONFIG.road_piece_m), 0), len(table) - 1)])
 
 
 def scooter_at_start(
@@ -228,14 +238,14 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
     """
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
-    n = round(SPAN / recorded.dt)
+    n = round(CONFIG.roller_span_s / recorded.dt)
     speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
     mean_v, mean_f, square = (block_means(x, n) for x in (speed, force, speed**2))
     spans = len(mean_v)
-    smooth = running_mean(speed, 2 * round(SMOOTHED / recorded.dt / 2) + 1)
+    smooth = running_mean(speed, 2 * round(CONFIG.roller_smoothing_s / recorded.dt / 2) + 1)
     acceleration = np.diff(smooth[np.minimum(np.arange(spans + 1) * n, len(smooth) - 1)]) / (n * recorded.dt)
-    moving = mean_v > ROLLING
-    if moving.sum() < LEAST_SPANS:
+    moving = mean_v > CONFIG.roller_m_s
+    if moving.sum() < CONFIG.roller_spans:
         raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")
     matrix: Any = np.stack([acceleration, np.ones(spans), mean_v, square], axis=1)[moving]
     return Dynamometer(*np.linalg.lstsq(matrix, mean_f[moving], rcond=None)[0].tolist())

@@ -88,7 +88,7 @@ class SimulationSummary:
     kind: Annotated[str, "cycle, route, ride (open loop) or ride (predictive)"]
     vehicle: Annotated[str, "name of the vehicle"]
     payload_kg: Annotated[float, "mass of rider and luggage"]
-    payload_from: Annotated[str, "source of it: --payload, rides.json beside the log, or the vehicle file"] = (
+    payload_from: Annotated[str, "source of it: --payload, rides.json with the log, or the vehicle file"] = (
         "the vehicle file"
     )
     step_s: Annotated[float, "step of the simulation"]
@@ -96,7 +96,7 @@ class SimulationSummary:
     distance_km: Annotated[float, "ridden"]
     speed_max_km_h: Annotated[float, "greatest speed"]
     repetitions: Annotated[float, "times that the cycle was ridden; the last may be unfinished"]
-    energy_wh: Annotated[float, "delivered by the pack, less what was recovered"]
+    energy_wh: Annotated[float, "delivered by the pack, less the energy recovered"]
     energy_recovered_wh: Annotated[float, "charged into the pack"]
     energy_cells_wh: Annotated[float, "that left the cells' chemistry: energy_wh and the heat of the battery"]
     consumption_wh_km: Annotated[float | None, "energy_wh over distance; null below 0.1 km"]
@@ -116,7 +116,7 @@ class SimulationSummary:
     shortfall_s: Annotated[float, "their time in all"]
     beyond_battery: Annotated[
         list[BeyondEntry],
-        "what the battery cannot give: charge (true: none is left; false: a load pulled its voltage to the cut-off), "
+        "demands beyond the battery: charge (true: empty; false: a load pulled its voltage to the cut-off), "
         "where it begins time_s, distance_km, soc, current_a, voltage_v; duration_s in all; cutoff_v",
     ]
     range_by_energy_km: Annotated[
@@ -155,7 +155,7 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
 
 
 def by_energy(result: Run, scooter: Scooter) -> float | None:
-    """Distance ridden and energy left over the consumption [m]; None of a ride that continued without charge."""
+    """Distance ridden and energy left over the consumption [m]; unknown if the ride continued without charge."""
     if result.beyond and result.beyond[-1].charge and not result.empty:
         return None
     return range_by_energy(scooter, result)
@@ -270,7 +270,7 @@ def _beyond_texts(summary: SimulationSummary) -> list[str]:
     for b in summary.beyond_battery:
         place = f"{b.time_s:.0f} s, {b.distance_km:.2f} km"
         if b.charge:
-            text = f"no charge is left from {place}: the ride goes on {b.duration_s:.0f} s that no pack can give"
+            text = f"no charge is left from {place}: the ride continues {b.duration_s:.0f} s that no pack can give"
             texts.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
             continue
         when = f"from {place}, for {b.duration_s:.0f} s in all" if b.duration_s >= 1.0 else f"at {place}"

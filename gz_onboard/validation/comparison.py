@@ -212,7 +212,7 @@ class SocReference:
 
     @property
     def cells(self) -> tuple[str, str, str]:
-        """Start, charge drawn and what the voltage says, as text."""
+        """Start, charge drawn and difference by the voltage, as text."""
         says = "–" if self.voltage_says is None else f"{self.voltage_says:+.1f} ± {self.voltage_sd:.1f}"
         return f"{self.start:.1f} ± {self.start_sd:.1f}", f"{self.drawn:.1f} ± {self.drawn_sd:.1f}", says
 
@@ -252,11 +252,11 @@ Pooled = dict[str, dict[str, dict[str, dict[str, dict[str, PooledMeans]]]]]
 
 @dataclass(frozen=True)
 class ValidatedRide:
-    """What was found of a ride."""
+    """The result of one ride."""
 
     file: Annotated[str, "the log"]
     name: Annotated[str, "of the ride"]
-    kind: Annotated[str | None, "as noted in rides.json beside the log, or null"]
+    kind: Annotated[str | None, "as noted in rides.json in the folder of the log, or null"]
     vehicle: Annotated[str, "name of the vehicle"]
     payload_kg: Annotated[
         float, "mass of rider and luggage: --payload, or as noted in rides.json, or of the vehicle file"
@@ -280,10 +280,10 @@ class ValidatedRide:
     cells_series: Annotated[int, "cells in series, whose voltages make the pack's"]
     soc_reference: Annotated[
         SocReference | None,
-        "what the state of charge is compared with, in percent of the charge: start, start_sd, drawn, drawn_sd, "
+        "reference of the state of charge, in percent of the charge: start, start_sd, drawn, drawn_sd, "
         "voltage_says, voltage_sd; or null",
     ]
-    missing: Annotated[list[str], "what could not be judged, or not as well, and why"]
+    missing: Annotated[list[str], "channels and conditions that could not be judged, or not as well, and why"]
     passed: Annotated[bool, "whether open loop, predictive and components passed"]
     plot: Annotated[str | None, "file, or null"]
 

@@ -7,7 +7,7 @@
     temperatures        of motor, inverter and cells, from their measured currents, voltage and speed
 
 Current that the motor's drag takes without load (iron loss) is the wheel's: torque at the shaft is the torque constant
-times current less that, and the electric power of the rest is what the inverter draws.
+times current less that, and the inverter draws the electric power of the rest.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def time_moving(measured: Mapping[str, Array]) -> Array:
 
 
 def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
-    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first."""
+    """Pack voltage [V] per second by the circuit of `model.battery`, at rest before the first."""
     battery = vehicle.pack
     m = battery.cells_parallel
     columns = (
@@ -102,7 +102,7 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         cell = amperes / m
         r0, r1, c1 = battery.circuit(soc, celsius)
         decay = np.exp(-0.5 / (r1 * c1))
-        v1 = decay * v1 + (1 - decay) * r1 * cell  # to its middle: what is measured is the second's mean
+        v1 = decay * v1 + (1 - decay) * r1 * cell  # to its middle, as measurements are means of a second
         half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
         soc -= half
         q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken, "time_moving": moving}

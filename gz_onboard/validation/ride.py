@@ -139,7 +139,7 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
     judged = {name: c.errors(CONFIG.component_gate_percent) for name, c in alone.items() if _enough(c)}
     if not judged and not any(verdict.channels for verdict in verdicts.values()):
         channels = ", ".join(channel.label for channel in CHANNELS.values())
-        raise InputError(f"{log}: nothing in it can be compared with its simulation: it has none of {channels}")
+        raise InputError(f"{log}: nothing in it can be compared with its simulation: it needs one of {channels}")
     components_passed = all(errors.passed for errors in judged.values())
     conditions, missing = riding_conditions(measured)
     missing += _not_judged(ride, commands)
@@ -175,7 +175,7 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
     return ComparedRide(result, comparisons)
 
 
-# --- what was measured --------------------------------------------------------------------------------------------
+# --- measurements -------------------------------------------------------------------------------------------------
 
 
 def _at_most(worth: float, most: float, progress: Progress) -> Progress:
@@ -199,7 +199,7 @@ def measure(log: Path, vehicle: Vehicle, progress: Progress = lambda _: None) ->
     if length < CONFIG.shortest_s:
         raise InputError(f"{log}: {length} s are too short a ride to judge; at least {CONFIG.shortest_s} s")
     moving = int((np.abs(seconds["speed"]) > CONFIG.standing_m_s).sum())
-    if moving < CONFIG.least_seconds:  # percentages of what is measured at a halt are those of noise
+    if moving < CONFIG.least_seconds:  # percentages at a halt are those of noise
         what = f"moves for only {moving} of its {length} s" if moving else f"only stands, for all of its {length} s"
         least = f"at least {CONFIG.least_seconds} s of it"
         raise InputError(f"{log}: the vehicle {what}: there is no riding to judge; {least}")
@@ -216,7 +216,7 @@ def _without_noise(recorded: Recorded) -> Array:
 
 
 def per_second(recorded: Recorded) -> dict[str, Array]:
-    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power."""
+    """Measurements as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power."""
     rate = round(1 / recorded.dt)
     measured = {role: block_means(values, rate) for role, values in recorded.signals.items()}
     smooth = _without_noise(recorded)
@@ -294,7 +294,7 @@ def _commands(ride: MeasuredRide) -> dict[str, Command]:
 
 
 def _not_judged(ride: MeasuredRide, commands: Mapping[str, Command]) -> list[str]:
-    """What was not measured, and what follows."""
+    """Measurements that are missing, and their consequence."""
     recorded = ride.recorded
     missing = [
         f"{channel.label} not judged: not measured" for name, channel in CHANNELS.items() if name not in ride.seconds
@@ -304,7 +304,7 @@ def _not_judged(ride: MeasuredRide, commands: Mapping[str, Command]) -> list[str
         missing.append(
             "grade is the on-board filter's, by accelerometer and altitude: wrong by some "
             f"{100 * CONFIG.grade_error:g} % in the first minutes, {newtons:.0f} N of road load; a "
-            f"{recorded.name}.route.csv beside the log would give it"
+            f"{recorded.name}.route.csv next to the log would give it"
         )
     if "open_loop" not in commands:
         gone = [name for name in ("throttle", "brake") if name not in recorded.signals]

@@ -39,7 +39,7 @@ MEANINGS = {
     "predictive": "the same speed takes another current or torque: road load, losses, or how the throttle is opened",
     "components": "with measured inputs this part is still off: its parameters or its equation",
 }
-"""What it means that a form does not pass."""
+"""Meaning of a form that does not pass."""
 
 
 def write_report(file: Path, rides: Sequence[ValidatedRide], together: Pooled) -> None:
@@ -53,7 +53,7 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Pooled) -
     for where in together:
         heads, rows = by_condition(together, where)
         parts.append(f"<h3>On the {where}</h3>{html_table(heads, rows, range(1, len(heads)))}")
-    parts.append("<h2>What could not be judged</h2><ul>")
+    parts.append("<h2>Not judged</h2><ul>")
     parts += [f"<li>{html.escape(r.name)}: {html.escape(text)}</li>" for r in rides for text in r.missing]
     parts.append(f"</ul><h2>Definitions</h2><pre>{html.escape(comparison.__doc__ or '')}</pre>")
     parts += [f"<h2>{html.escape(ride.name)}</h2>{image(Path(ride.plot))}" for ride in rides if ride.plot]
@@ -73,7 +73,7 @@ def _tables(rides: Sequence[ValidatedRide]) -> dict[str, Table]:
         "Summary": _summary(rides),
         "Comparison with the thesis": (THESIS_HEADS, thesis_rows(rides)),
         **{f"{FORMS[form].capitalize()}, percent (limit {limits[form]:g} %)": _gate(rides, form) for form in FORMS},
-        "What the state of charge is compared with, percent": _charge(rides),
+        "Reference of the state of charge, percent": _charge(rides),
     }
 
 

@@ -45,7 +45,7 @@ def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys):
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
     assert (ride["paused_s"], ride["gaps_s"]) == (0, 0)
-    assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride goes on" in said
+    assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride continues" in said
     assert ride["clock"] == [said.partition("clock  ")[2].partition("\n")[0].strip()]
     checked = check_log(log, read_vehicle("reference"), quick=True)
     assert checked.duration_s == pytest.approx(SECONDS, abs=1)

@@ -335,7 +335,7 @@ def table(header, row, seconds=40):
     [
         (
             table("time [s],speed [m/s]", "{t},5"),
-            "nothing in it can be compared with its simulation: it has none of battery current",
+            "nothing in it can be compared with its simulation: it needs one of battery current",
         ),
         (
             table("time [s],speed [m/s],pack_voltage [V]", "{t},0.1,50"),
