@@ -121,6 +121,9 @@ def stepper(effects: Sequence[Bound], dt: float | None) -> Callable[[Mapping[str
     lines = []
     for i, bound in enumerate(effects):
         call = _call(bound.effect.term, bound.values, f"term{i}", scope)
+        if not bound.effect.term.quantities:
+            scope[f"constant{i}"] = bound({})
+            call = f"constant{i}"
         if bound.effect.decay and dt is not None:
             scope[f"value{i}"], kept = 0.0, _call(bound.effect.decay, bound.values, f"decay{i}", scope)
             if bound.has_fixed_time:

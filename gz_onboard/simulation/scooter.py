@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import sqrt
 from operator import mul
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.model.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
@@ -90,7 +90,7 @@ class Scooter:
         self._build_mechanic(options)
         self._names = [*self._force_names, *self._rolling_names, "turning", "dynamometer", "tyre_slip", "brakes"]
         self._names += ["gearing", *self._loss_names, "bms", "battery_heat", "not_delivered", "idle", "charge"]
-        self._noted: list[tuple[float, ...]] = []  # of each step since the last booking, by `_names`
+        self._noted: list[tuple[Any, ...]] = []  # of each step since the last booking, by `_names`
         self._booked: dict[str, float] = dict.fromkeys(self._names, 0.0)  # J since the start; charge in A·s
         self._cooled = dict(self._booked)  # the same at the last step of the cooling networks
         self._since_cooling = 0.0  # s
@@ -131,16 +131,18 @@ class Scooter:
         inside = stepper(cells, dt) if cells else None
         self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
         self.motor = options.get("motor")
-        of_motor = [] if self.motor else model.at(Port.MOTOR_LOSS)
-        of_inverter = model.at(Port.INVERTER_LOSS)
+        of_motor, of_inverter = [] if self.motor else model.at(Port.MOTOR_LOSS), model.at(Port.INVERTER_LOSS)
         losses = [*of_motor, *of_inverter, *model.at(Port.DC_POWER)]
         turning_idly = self._q | {"motor_speed": 100.0, "motor_temperature": MILD}
-        self._losses, self._idle = stepper(losses, dt), stepper([e for e in of_motor if e(turning_idly)], None)
-        self._loss_names = ([self.motor.name] if self.motor else []) + [bound.effect.name for bound in losses]
-        motor_names = self._loss_names[: max(len(of_motor), 1 if self.motor else 0)]
-        inverter_names = [bound.effect.name for bound in of_inverter]
-        # The board's heat is in the pack's too, on which it stands: so its network was calibrated.
-        self._heats = {"motor": motor_names, "inverter": inverter_names, "pack": ["battery_heat", "bms"]}
+        self._losses = stepper(losses, dt)
+        self._idle = stepper([effect for effect in of_motor if effect(turning_idly)], None)  # those that cost then
+        of_replaced = [self.motor.name] if self.motor else []
+        self._loss_names = [*of_replaced, *(bound.effect.name for bound in losses)]
+        self._heats = {
+            "motor": [*of_replaced, *(bound.effect.name for bound in of_motor)],
+            "inverter": [bound.effect.name for bound in of_inverter],
+            "pack": ["battery_heat", "bms"],  # the board's too, which stands on it: so its network was calibrated
+        }
         self._torque_constant = p["torque_constant"]
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
@@ -278,25 +280,15 @@ class Scooter:
 
         # --- and at the wheels
         turned = share * radius * w_mean + front_share * v_mean  # m/s, of the tyres
-        self._noted.append(
-            (
-                v_mean,
-                turned,
-                *forces,
-                *rolling,
-                turning * v_mean,
-                absorbed * v_mean,
-                force * (radius * w_mean - v_mean),
-                braking * w_mean + front_braking * v_mean,
-                mechanical - drive * w_mean,
-                *losses,
-                bms,
-                pack_heat - bms,
-                -missing,
-                idle,
-                self.current,
-            )
+        of_wheels = (
+            turning * v_mean,
+            absorbed * v_mean,
+            force * (radius * w_mean - v_mean),
+            braking * w_mean + front_braking * v_mean,
+            mechanical - drive * w_mean,
         )
+        of_pack = (bms, pack_heat - bms, -missing, idle, self.current)
+        self._noted.append((v_mean, turned, forces, rolling, of_wheels, losses, of_pack))
         self._since_cooling += dt
         if self._since_cooling >= PERIOD - 1e-9:
             self._cool(self._since_cooling)
@@ -346,10 +338,12 @@ class Scooter:
         """Book the steps since the last booking."""
         if not self._noted:
             return
-        speed, turned, *columns = zip(*self._noted, strict=True)
-        forces = len(self._force_names)
-        for i in range(forces + len(self._rolling_names)):
-            columns[i] = tuple(map(mul, columns[i], speed if i < forces else turned))
+        speed, turned, forces, rolling, *others = zip(*self._noted, strict=True)
+        columns = [
+            *(map(mul, column, speed) for column in zip(*forces, strict=True)),
+            *(map(mul, column, turned) for column in zip(*rolling, strict=True)),
+            *(column for group in others for column in zip(*group, strict=True)),
+        ]
         for name, powers in zip(self._names, columns, strict=True):
             self._booked[name] += sum(powers) * self.dt
         self._noted.clear()

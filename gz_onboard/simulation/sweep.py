@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, closest
 from gz_onboard.model.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
 CELLS = ("battery.cells_parallel", "battery.cells_series")
 _SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
-_SPOKEN = {
-    "battery": CELLS[0],
-    "cells": CELLS[0],
-    "parallel": CELLS[0],
-    "cells_parallel": CELLS[0],
-    "series": CELLS[1],
-    "cells_series": CELLS[1],
-    "capacity": "cell_capacity",
-    "mass": "vehicle_mass",
-    "payload": "payload_mass",
-    "cda": "drag_area",
-}
-"""What is said for a parameter, so that the nearest by letters is the one that is meant."""
 _STEPS = 5
 _MOST_STEPS = 50
 
@@ -82,7 +68,10 @@ def sweep_of(name: str, values: Sequence[float], vehicle: Vehicle, place: str) -
     name = _SHORT.get(name, name)
     declared = declared_parameters(vehicle.model.effects)
     if name not in (*declared, *CELLS):
-        raise InputError(f"{place}: no parameter is called {name!r}{_meant(name, declared, vehicle)}")
+        known = {each.rpartition(".")[2]: each for each in (*declared, *CELLS)}
+        near = closest(name.rpartition(".")[2].lower(), known)
+        hint = f" (did you mean {known[near]!r}?)" if near else ""
+        raise InputError(f"{place}: no parameter is called {name!r}{hint}")
     low, high, unit = (1.0, 1000.0, "1")
     if name in declared:
         low, high, unit = declared[name].low, declared[name].high, declared[name].unit
@@ -92,15 +81,6 @@ def sweep_of(name: str, values: Sequence[float], vehicle: Vehicle, place: str) -
         if name in CELLS and value != round(value):
             raise InputError(f"{place}: {name} counts cells; {value:g} is not a whole number")
     return Sweep(name, unit, tuple(map(float, values)))
-
-
-def _meant(name: str, declared: Iterable[str], vehicle: Vehicle) -> str:
-    """The hint at the parameter meant by `name`, of which the last of its dotted parts counts."""
-    first = {effect.name: effect.parameters[0].name for effect in vehicle.model.effects if effect.parameters}
-    known = {name: name for name in declared} | _SPOKEN | first
-    last = name.rpartition(".")[2].lower()
-    match = difflib.get_close_matches(last, known, n=1, cutoff=0.6)
-    return f" (did you mean {known[match[0]]!r}?)" if match else nearest(last, known)
 
 
 def redesigned(vehicle: Vehicle, values: Mapping[str, float]) -> Vehicle:

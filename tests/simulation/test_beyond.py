@@ -56,14 +56,6 @@ def test_a_load_that_ends_the_ride_with_charge_left_is_named(kick: Path, capsys)
     assert "A pull the pack to 2" in text and f"its energy would do for {found['range_by_energy_km']:.1f} km" in text
 
 
-def test_range_by_energy_is_not_less_than_what_was_ridden_until_hot(kick: Path, capsys):
-    """In nine minutes no voltage of its cells settles: asked at the start, as if all had, the energy did for less."""
-    found, text = simulated(capsys, without_limits(kick), "--until-empty", "--ambient", "40")
-    assert found["soc_end"] > 0.3 and found["range_by"] == "cut-off"
-    assert found["range_by_energy_km"] >= found["range_km"] == found["distance_km"]
-    assert "it goes farther only at a lower current" in text and "energy would do" not in text
-
-
 def test_a_ride_without_charge_ends_where_it_had_none(kick: Path, capsys):
     found, text = simulated(capsys, kick, "--soc", "0.03")
     last = found["beyond_battery"][-1]

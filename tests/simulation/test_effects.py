@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks.backward import RideConditions, backward
@@ -113,27 +112,6 @@ def test_wind_costs_against_and_gives_along_by_the_heading():
     assert cost[0.0, "windy"] == pytest.approx(per_metre(by_place), rel=1e-6)
 
 
-def test_the_heading_is_that_of_the_road():
-    """A left circle turns it from north to the west, by the way over the radius."""
-    vehicle = extended("headwind")
-    scooter = Scooter(vehicle, lambda distance: (0.0, 1 / 50, 0.0), heading=0.5)
-    drive(scooter, stop_and_go, 20.0)
-    assert scooter.heading == pytest.approx(0.5 - scooter.distance / 50, abs=0.01)
-    given = Scooter(vehicle, bends, heading=lambda distance: 1.0 + distance / 1000)
-    drive(given, stop_and_go, 10.0)
-    assert given.heading == pytest.approx(1.0 + given.distance / 1000, abs=0.001)
-
-
-def test_slow_relaxation_is_a_second_rc_pair():
-    """The same as the pack of two pairs, which is code of its own."""
-    from tests.simulation.packs import SecondOrderPack
-
-    vehicle = extended("slow_relaxation", slow_resistance=0.012, slow_time=900.0)
-    one = ride(vehicle, 96.0)[0]
-    two = ride(BASE, 96.0, pack=SecondOrderPack(BASE.pack, 0.8, 0.012, 900.0))[0]
-    assert one.series["pack_voltage"] == pytest.approx(two.series["pack_voltage"], rel=1e-9)
-
-
 BEARING = """
 from gz_onboard.model.effect import Parameter, Port
 PORT = Port.MOTOR_LOSS
@@ -231,19 +209,3 @@ def test_what_the_sensors_show_of_it():
     assert false["BMS_PackCurrent"] == pytest.approx(1.1 * current + 0.5)
     late = {s.signal: latency(s, extended(pack_voltage_latency=0.3).parameters) - s.delay for s in SENSORS}
     assert {name: delay for name, delay in late.items() if delay} == {"BMS_PackVoltage": pytest.approx(0.3)}
-
-
-def test_weak_magnets_are_not_what_the_inverter_reports():
-    """Torque reported is 0.47 times current: with less torque for it, more current for the same ride."""
-
-    def ratio(torque_constant):
-        trace = Trace()
-        scooter = Scooter(extended(torque_constant=torque_constant), straight(), soc=0.8)
-        run = drive(scooter, trace.watch(stop_and_go), 20.0)
-        truth = trace.truth(scooter)
-        shown = next(s for s in SENSORS if s.signal == "INV_MotorTorque").read(truth)
-        driving = truth["motor_current"] > 1
-        assert (shown / np.where(driving, truth["motor_current"], 1))[driving] == pytest.approx(0.47)
-        return run.distance
-
-    assert ratio(0.40) < ratio(0.45)

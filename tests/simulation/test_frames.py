@@ -12,17 +12,14 @@ import pytest
 
 from gz_onboard.can.codec import NOT_AVAILABLE, Codec
 from gz_onboard.cli import main
-from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.events import WINDOW, Reason, State
+from gz_onboard.events import WINDOW, State
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts import Dynamometer, road_table
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS
 from gz_onboard.simulation.trace import Trace
-from gz_onboard.simulation.turning import chassis, lean_of
 from gz_onboard.vehicle import read_vehicle
 from tests.events import events_of
 from tests.support import ROOT, reference, ridden
@@ -96,13 +93,6 @@ def test_the_estimate_is_the_truth():
     assert energy == pytest.approx(ride()[0].energy, rel=0.01)
 
 
-def test_the_inverter_is_behind_the_cable_of_the_vehicle_file():
-    truth = ride()[1]
-    (sensor,) = (sensor for sensor in SENSORS if sensor.signal == "INV_DcVoltage")
-    behind = truth["pack_voltage"] - reference().parameters["cable_resistance"] * truth["pack_current"]
-    assert sensor.read(truth) == pytest.approx(behind, abs=1e-12)
-
-
 def test_lean_and_grade_are_found():
     truth = ride()[1]
     run = estimated()
@@ -114,23 +104,6 @@ def test_lean_and_grade_are_found():
     hill = np.flatnonzero((truth["distance"] > 850) & (truth["distance"] < 990))
     grades = [e.grade for e in run.between(truth["time"][hill[0]] - shift, truth["time"][hill[-1]] - shift)]
     assert np.mean(grades) == pytest.approx(0.03, abs=0.008)
-
-
-@pytest.mark.parametrize("name", ["straight", "planar", "leaning"])
-def test_lean_is_that_of_round_tyres(name):
-    """In a long bend: more than a thin disc's, of every chassis what the leaning one settles at."""
-    p = reference().parameters
-    speed, curvature = 8.0, 1 / 25
-    scooter = Scooter(
-        reference(), lambda distance: (0.0, curvature, 0.0), soc=0.8, speed=speed, chassis=chassis(name, p)
-    )
-    trace = Trace()
-    drive(scooter, trace.watch(along([speed] * 100)), 6.0)
-    truth = trace.truth(scooter)
-    v = truth["speed"][400]
-    ideal = -atan(v * v * curvature / GRAVITY)
-    assert truth["lean"][400] == pytest.approx(lean_of(ideal, p["tyre_crown_radius"], p["cg_height"]), rel=0.01)
-    assert truth["lean"][400] < 1.05 * ideal
 
 
 def test_each_message_has_its_rate():
@@ -162,45 +135,9 @@ def test_noise_and_delay_are_as_declared(role, name, factor, delay, sd):
     assert (values - factor * truth[name][wrong]).std() > 1.1 * errors.std()
 
 
-def test_altitude_wanders_slowly():
-    times, values = column("gps_altitude")
-    errors = values - ALTITUDE - true("climb", times, 0.4)
-    assert 0.4 < np.sqrt(np.mean(errors**2)) < 4.0
-    assert np.diff(errors).std() < 0.3 * 1.5
-
-
-def test_what_the_scooter_does_not_send_is_not_available():
-    database = reference().mapping.database
-    absent = {"BMS_CellVoltageMin", "BMS_CellVoltageMax", "INV_CurrentLimit", "HBM_SteeringAngle", "BMS_CycleCount"}
-    codec = Codec(reference().mapping)
-    seen = set()
-    for _, identifier, data, _ in frames()[:5000]:
-        values = codec.values(database.get_message_by_frame_id(identifier).name, data)
-        seen |= absent & set(values)
-        assert all(values[name] is None for name in absent & set(values))
-        assert database.get_message_by_frame_id(identifier).length == len(data)
-    assert seen == absent
-
-
 def test_the_same_seed_gives_the_same_bytes():
     assert frames(1) == frames(1)
     assert frames(1) != frames(2)
-
-
-def test_files_of_the_same_seed_are_the_same(tmp_path):
-    files = [tmp_path / name for name in ("one.blf", "two.blf", "other.blf")]
-    for file, seed in zip(files, (1, 1, 2), strict=True):
-        write_frames(file, simulate_frames(reference(), ride()[1], seed))
-    one, two, other = (file.read_bytes() for file in files)
-    assert one == two
-    assert one != other
-
-
-def test_each_sensor_is_in_the_dbc_files():
-    known = {signal.name for message in reference().mapping.database.messages for signal in message.signals}
-    names = [sensor.signal for sensor in (*SENSORS, *ROLLER)]
-    assert set(names) <= known
-    assert len(names) == len(set(names))
 
 
 def test_lost_frames_show_in_the_counters_and_change_no_other():
@@ -214,18 +151,6 @@ def test_lost_frames_show_in_the_counters_and_change_no_other():
         assert dropped[name] > 0
         assert abs(run.pipeline.codec.lost[name] - dropped[name]) <= 2  # at the ends no counter tells
     assert not {reason for _, reason in run.faults} - {NOT_AVAILABLE}
-
-
-def test_gaps_of_the_gps_have_no_fix():
-    dropouts = Dropouts(frames=0.0, gps_gap_every=40.0, gps_gap=(10.0, 12.0))
-    run = ridden(frames(3, dropouts))
-    without = [e for e in run.estimates if e.reasons & Reason.NO_GPS]
-    assert without
-    _, fixes = column("gps_fix", frames(3, dropouts))
-    assert set(fixes) == {0.0, 3.0}
-    assert len(column("latitude", frames(3, dropouts))[0]) == pytest.approx(
-        (fixes == 3).sum(), abs=4
-    )  # the phases differ
 
 
 def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():

@@ -14,15 +14,13 @@ import pytest
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
 from gz_onboard.discovery.grid import vibration as of_samples
-from gz_onboard.model.effect import MOVING, load_effect
+from gz_onboard.model.effect import load_effect
 from gz_onboard.recording.recording import read_recording
-from gz_onboard.simulation.parts import Dynamometer, straight
+from gz_onboard.simulation.parts import straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter
-from gz_onboard.simulation.sensors import SENSORS
-from gz_onboard.simulation.trace import Trace
-from gz_onboard.validation.components import battery_voltage, road_load
+from gz_onboard.validation.components import road_load
 from gz_onboard.validation.ride import per_second
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import LOGS, joined, without_cell_effects
@@ -97,31 +95,6 @@ def test_backward_agrees_with_forward(folder: Path):
             assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02)
 
 
-def test_a_roller_does_not_shake(folder: Path):
-    run, scooter = ride(extended(folder, "rough_road", "rough_tyre"), Dynamometer(185.0))
-    assert scooter.vibration == 0.0
-    assert run.ledger.get("rough_road", 0.0) == run.ledger["rough_tyre"] == 0.0
-
-
-def test_the_auxiliary_current_shows_it(folder: Path):
-    def currents(vehicle: Vehicle) -> Any:
-        trace, scooter = Trace(), Scooter(vehicle, soc=0.8)
-        drive(scooter, trace.watch(stop_and_go), 20.0)
-        truth = trace.truth(scooter)
-        return truth["auxiliary_power"], next(s for s in SENSORS if s.signal == "HBM_AuxCurrent").read(truth)
-
-    (power, current), (plain, _) = currents(extended(folder, "rough_power")), currents(BASE)
-    assert power[-1] - plain[-1] == pytest.approx(20 * BASE.riding.vibration)
-    assert power[0] == pytest.approx(plain[0])
-    assert current[-1] * 40 < power[-1] < current[-1] * 60
-
-
-def test_a_loose_contact_lacks_voltage(folder: Path):
-    loose, plain = (ride(v, vibration=2.0)[0].series["pack_voltage"] for v in (extended(folder, "loose_contact"), BASE))
-    series = BASE.pack.cells_series
-    assert (plain - loose)[100] == pytest.approx(series * 0.01 * 2.0, rel=0.1)
-
-
 # --- recorded rides -----------------------------------------------------------------------------------------------
 
 
@@ -144,12 +117,6 @@ def test_of_a_recorded_ride_it_is_what_the_accelerometer_shows(recorded: Recorde
     assert recorded.vibration_at(middle) == pytest.approx(found[at], abs=0.2)
 
 
-def test_of_a_vehicle_that_does_not_read_it_nothing_is_worked_out():
-    plain = read_recorded(RIDE, BASE)
-    assert plain.vibration is None
-    assert "vibration" not in plain.signals
-
-
 def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
     vehicle = extended(folder, "rough_road")
     measured = per_second(recorded)
@@ -160,21 +127,6 @@ def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
     del measured["vibration"]
     more = road_load(vehicle, measured, 20.0, None) - road_load(BASE, measured, 20.0, None)
     assert set(np.round(more, 6)) <= {0.0, round(NEWTONS * BASE.riding.vibration, 6)}
-
-
-def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, recorded: Recorded, tmp_path: Path):
-    vehicle = extended(folder, "loose_contact")
-    measured = per_second(recorded)
-    fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(vehicle, measured, 0.8)
-    assert fewer == pytest.approx(BASE.pack.cells_series * 0.01 * measured["vibration"], abs=1e-9)
-    (tmp_path / "wearing.py").write_text(
-        EFFECT.format(port="CELL_VOLTAGE", value=0.001, name="wearing")
-        .replace("(vibration,", "(time_moving,")
-        .replace("* vibration", "* time_moving")
-    )
-    fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(extended(tmp_path, "wearing"), measured, 0.8)
-    moving = np.cumsum(measured["speed"] > MOVING)
-    assert fewer == pytest.approx(BASE.pack.cells_series * 0.001 * moving, abs=1e-6)
 
 
 # --- from a vehicle's file ----------------------------------------------------------------------------------------

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
-from math import sqrt
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,30 +18,11 @@ from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from gz_onboard.vehicle_check.new import kinds
 from tests.support import LOGS, ROOT
-from tests.vehicles.test_scooter_to_van import AIR, BUILDS, GRAVITY, STEP, Build, Truth, encode, speeds
+from tests.vehicles.test_scooter_to_van import BUILDS, Cell, Points, Truth, driven, encode
 
 ARGUMENTS = ["--kind", "scooter", "--series", "14", "--capacity", "30", "--mass", "90", "--wheel-radius", "0.22"]
-Points = tuple[tuple[float, float], ...]
 KEY = re.compile(r"^(\w+) = ", re.M)
 REFERENCE = (ROOT / "gz_onboard/vehicles/reference.toml").read_text(encoding="utf-8")
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One cell of a chemistry, as it was measured; not the mean of several that the written file has."""
-
-    ocv: Points  # V over SOC
-    r0: float  # ohm·A·h
-    r1: float
-
-    def rest(self, soc: float) -> float:
-        (s0, u0), (s1, u1) = next((a, b) for a, b in pairwise(self.ocv) if soc <= b[0])
-        return u0 + (soc - s0) * (u1 - u0) / (s1 - s0)
-
-    def energy(self, soc: float, cutoff: float) -> float:
-        """Wh of 1 A·h that come out slowly from `soc` to the `cutoff` [V]."""
-        step = soc / 500
-        return step * sum(volts for i in range(500) if (volts := self.rest(step * (i + 0.5))) > cutoff)
 
 
 M50: Points = ((0, 2.5), (0.02, 2.86), (0.05, 3.11), (0.1, 3.3), (0.2, 3.485), (0.3, 3.581), (0.4, 3.667), (0.6, 3.841))
@@ -52,7 +31,21 @@ P42A: Points = ((0, 2.506), (0.045, 3.146), (0.096, 3.323), (0.15, 3.422), (0.29
 P42A += ((0.834, 4.064), (0.95, 4.101), (1, 4.193))
 APR: Points = ((0, 2.01), (0.012, 2.74), (0.027, 2.93), (0.053, 3.087), (0.089, 3.194), (0.297, 3.277), (0.983, 3.351))
 APR += ((0.995, 3.418), (1, 3.598))
-CELLS = {"nmc": Cell(M50, 0.05, 0.05), "nca": Cell(P42A, 0.03, 0.02), "lfp": Cell(APR, 0.025, 0.02)}
+# Cells as they were measured, of 30 A·h; not the mean of several that the written file has.
+CELLS = {
+    "nmc": Cell(M50, 0.05 / 30, 0.05 / 30, 30.0),
+    "nca": Cell(P42A, 0.03 / 30, 0.02 / 30, 30.0),
+    "lfp": Cell(APR, 0.025 / 30, 0.02 / 30, 30.0),
+}
+MOPED = replace(
+    BUILDS["moped"], mass=90.0, payload=75.0, drag=0.5, series=14, parallel=1, capacity=30.0, auxiliary=30.0
+)
+
+
+def energy(cell: Cell, soc: float, cutoff: float) -> float:
+    """Wh of 1 A·h that come out slowly from `soc` to the `cutoff` [V]."""
+    step = soc / 500
+    return step * sum(volts for i in range(500) if (volts := cell.rest(step * (i + 0.5))) > cutoff)
 
 
 def written(folder: Path, chemistry: str, *others: str) -> Path:
@@ -61,42 +54,27 @@ def written(folder: Path, chemistry: str, *others: str) -> Path:
     return file
 
 
-def drive(cell: Cell, build: Build, database: Database, truth: Truth, duration: float) -> Iterator[list[Frame]]:
-    """The frames of a drive by the written DBC, of a pack of these cells: 14 by 10 of 3 A·h, and 90 kg with a rider."""
-    series, pack, mass, drag, rolling = 14, 30.0, 90 + 75.0, 0.5, 0.013
-    inside, pair, v1, before, way = series * cell.r0 / pack, series * cell.r1 / pack, 0.0, 0.0, 1000.0
-    for i, v in enumerate(speeds(build, duration)):
-        mean, a = (v + before) / 2, (v - before) / STEP
-        before = v
-        wheel = (mass * a + (rolling * mass * GRAVITY + 0.5 * AIR * drag * mean * mean) * (mean > 0)) * mean
-        power = 30.0 + (wheel / 0.85 if wheel > 0 else 0.4 * wheel)
-        source = series * cell.rest(truth.soc) - v1
-        current = (source - sqrt(source * source - 4 * inside * power)) / (2 * inside)
-        volts = source - inside * current
-        truth.soc -= current * STEP / 3600 / pack
-        v1 += STEP / 30.0 * (pair * current - v1)
-        truth.energy += volts * current * STEP
-        truth.distance += mean * STEP
-        way += mean * STEP / 1000
+def drive(chemistry: str, database: Database, truth: Truth, duration: float) -> Iterator[list[Frame]]:
+    """The frames of a drive by the written DBC."""
+    for ns, v, volts, current in driven(MOPED, truth, duration, CELLS[chemistry]):
         of = {"PackVoltage": volts, "PackCurrent": current, "CellTemperature": 25.0, "StateOfCharge": 100 * truth.soc}
-        motion = {"Speed": 3.6 * v, "Odometer": way, "OutsideTemperature": 20.0}
-        ns = round(i * STEP * 1e9)
+        motion = {"Speed": 3.6 * v, "Odometer": 1000.0 + truth.distance / 1000, "OutsideTemperature": 20.0}
         frames = ((256, "Battery", of), (257, "Motion", motion))
         yield [(ns + k, key, encode(database, name, **values), 0) for k, (key, name, values) in enumerate(frames)]
 
 
 @pytest.mark.parametrize(("chemistry", "soc"), [("nmc", 0.3), ("nca", 0.85), ("lfp", 0.85), ("lfp", 0.3)])
 def test_it_drives_to_a_range_within_its_interval(tmp_path, chemistry, soc):
-    cell, vehicle, truth = CELLS[chemistry], read_vehicle(written(tmp_path, chemistry)), Truth(soc)
+    vehicle, truth = read_vehicle(written(tmp_path, chemistry)), Truth(soc)
     pipeline = Pipeline(vehicle)
-    for frames in drive(cell, BUILDS["moped"], vehicle.mapping.database, truth, 80.0):
+    for frames in drive(chemistry, vehicle.mapping.database, truth, 80.0):
         pipeline.advance(frames, frames[0][0])
     e = pipeline.last
     assert e is not None and e.soc is not None and e.soc_sd is not None and e.range_p10 and e.range_p90
     assert pipeline.counts().dropped == pipeline.counts().implausible == 0
     assert not e.reasons & (Reason.VOLTAGE_MISMATCH | Reason.CURRENT_MISMATCH | Reason.SENSOR_DISTRUSTED)
-    energy = cell.energy(truth.soc, vehicle.pack.cutoff_voltage) * 14 * 30 * 3600
-    assert e.range_p10 < energy * truth.distance / truth.energy < e.range_p90
+    left = energy(CELLS[chemistry], truth.soc, vehicle.pack.cutoff_voltage) * 14 * 30 * 3600
+    assert e.range_p10 < left * truth.distance / truth.energy < e.range_p90
     assert abs(e.soc - truth.soc) < 2 * e.soc_sd
     on_the_flat = chemistry == "lfp" and soc > 0.5
     assert bool(e.reasons & Reason.SOC_UNCERTAIN) is on_the_flat
@@ -152,7 +130,7 @@ def test_each_kind_is_checked_and_sends_range_frames(tmp_path, kind, capsys):
 def test_an_estimate_and_a_check_on_a_log_of_it(tmp_path, capsys):
     file, log = written(tmp_path, "nmc"), tmp_path / "ride.log"
     database = read_vehicle(file).mapping.database
-    driven = (frame for frames in drive(CELLS["nmc"], BUILDS["moped"], database, Truth(0.6), 70.0) for frame in frames)
+    driven = (frame for frames in drive("nmc", database, Truth(0.6), 70.0) for frame in frames)
     lines = (f"({1.7e9 + ns / 1e9:.6f}) can0 {key:03X}#{data.hex()}\n" for ns, key, data, _ in driven)
     log.write_text("".join(lines), encoding="utf-8")
     capsys.readouterr()

@@ -7,26 +7,19 @@ names a folder that holds them (real/tlmoto_motostudent_kiro, real/can_logs).
 from __future__ import annotations
 
 import csv
-import gzip
 import math
 import os
 import struct
 from bisect import bisect_left
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
 from gz_onboard.can.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
-from gz_onboard.can.dbc import load_database
-from gz_onboard.can.mapping import pgn, read_mapping
-from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.decode import feed
-from gz_onboard.recording.logs import read_frames, read_log
-from gz_onboard.recording.readers.contents import LogDamage
-from gz_onboard.toml import Table
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import Event, events_of
 
@@ -173,43 +166,6 @@ def test_tlmoto_real_frames_against_what_others_decoded(session):
         assert wrong <= faults.get(("CTRL_Supply.CTRL_BatteryVoltage", RANGE), 0) * (role == "pack_voltage"), column
 
 
-@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
-def test_tlmoto_real_cell_voltages_against_what_others_decoded(session):
-    folder = real("tlmoto_motostudent_kiro")
-    codec = Codec(vehicle("tlmoto").mapping)
-    cells = {
-        (identifier - 50, round(time_ns / MS)): list(codec.values(name_of(codec, identifier), data).values())
-        for batch in read_frames(folder / f"{session}.candump.log")
-        for time_ns, identifier, data, _ in batch
-        if 51 <= identifier <= 55
-    }
-    with (folder / f"{session}_cells.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    compared = 0
-    for row in rows:
-        for i, value in enumerate(cells[int(row["pack"]), round(float(row["t_s"]) * 1000)], 1):
-            truth = float(row[f"v_cell{i}_V"])
-            assert value == (pytest.approx(truth, abs=1e-6) if 2.495 < truth < 4.305 else None)
-            compared += value is not None
-    assert compared > 5 * len(rows) / 2
-
-
-@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
-def test_tlmoto_real_frames_go_the_whole_way(session):
-    path = real("tlmoto_motostudent_kiro", f"{session}.candump.log")
-    estimates: list[Estimate] = []
-    pipeline = Pipeline(vehicle("tlmoto"), observer=estimates.append)
-    feed(pipeline, read_log(path))
-    assert pipeline.counts().dropped == 0
-    published = [e for e in estimates if e.state in (State.VALID, State.DEGRADED)]
-    assert len(published) > 0.5 * len(estimates)
-    for e in published:
-        assert e.soc is not None and -0.05 <= e.soc <= 1.05
-        assert e.range is not None and e.range_p10 is not None and e.range_p90 is not None
-        assert 0 <= e.range_p10 <= e.range <= e.range_p90 < 1e6
-        assert e.speed is None or abs(e.speed) < 45
-
-
 # --- a car's satellite receiver with valid bits -------------------------------------------------------------------
 
 
@@ -238,47 +194,6 @@ def test_car_frames_of_its_layout():
     assert codec.faults == {("Status.FixType", RANGE): 1}
 
 
-CAR_SIGNALS = {
-    "gps_fix": ("gnss_status", "FixType", 1.0),
-    "latitude": ("gnss_pos", "Latitude", 1.0),
-    "longitude": ("gnss_pos", "Longitude", 1.0),
-    "gps_altitude": ("gnss_altitude", "Altitude", 1.0),
-    "gps_speed": ("gnss_speed", "Speed", 1.0),
-    "accel_z": ("gnss_imu", "AccelerationX", 1.0),
-    "rate_z": ("gnss_imu", "AngularRateX", math.pi / 180),
-}
-
-
-@pytest.mark.parametrize("drive", ["css_car_gps_imu_obd2_3", "css_car_gps_imu_obd2_4"])
-def test_car_real_frames_as_by_cantools_with_the_makers_dbc(tmp_path, drive):
-    folder = real("can_logs")
-    makers = folder / "dbc" / "canmod-gps.dbc"
-    database = load_database([makers])
-    by_id = {message.frame_id: message for message in database.messages}
-    roles = "\n".join(f'{role} = "{signal}"' for role, (_, signal, _) in CAR_SIGNALS.items())
-    (tmp_path / "m.toml").write_text(f"dbc = ['{makers}']\n[bus]\nnot_available = 'none'\n[roles]\n{roles}\n")
-    ours, theirs = Codec(vehicle("car").mapping), Codec(read_mapping(Table.read(tmp_path / "m.toml")))
-    truth: dict[str, list[float]] = {}
-    count = 0
-    for batch in read_frames(folder / f"{drive}.log.gz"):
-        count += len(batch)
-        left, right = values(ours, events_of(ours, batch)), values(theirs, events_of(theirs, batch))
-        truth.clear()
-        for _, identifier, data, _ in batch:
-            if message := by_id.get(identifier):
-                decoded = message.decode_simple(data, decode_choices=False)
-                for role, (name, signal, factor) in CAR_SIGNALS.items():
-                    if message.name == name:
-                        truth.setdefault(role, []).append(float(decoded[signal]) * factor)  # type: ignore[arg-type]
-        for role, numbers in truth.items():
-            assert [value for _, value in left[role]] == pytest.approx(numbers, rel=1e-12, abs=1e-12)
-            assert [value for _, value in right[role]] == pytest.approx(numbers, rel=1e-12, abs=1e-12)
-        assert left.keys() == right.keys() == truth.keys()
-    assert ours.received == theirs.received == count > 70_000
-    assert not ours.faults and not theirs.faults
-    assert set(theirs.unknown) == {0x7E8, 0x17F00010 | EFF_FLAG}  # answers to a scan tool; nobody knows
-
-
 # --- trucks: SAE J1939, by parameter group -------------------------------------------------------------------------
 
 
@@ -303,96 +218,7 @@ def test_truck_frames_of_its_layout():
     assert codec.unknown == {0x18F00E00 | EFF_FLAG: 1}
 
 
-@pytest.mark.parametrize(
-    ("drive", "count", "speeds"), [("css_truck_j1939_imu", 57_849, 12_719), ("css_truck_j1939_full", 150_411, 3_993)]
-)
-def test_truck_real_frames_as_by_cantools_with_another_dbc(drive, count, speeds):
-    folder = real("can_logs")
-    database = load_database([folder / "dbc" / "CSS-Electronics-SAE-J1939-DEMO.dbc"])
-    messages = {pgn(message.frame_id): message for message in database.messages}
-    codec = Codec(vehicle("truck").mapping)
-    compared: Counter[str] = Counter()
-    for batch in read_frames(folder / f"{drive}.log.gz"):
-        found = values(codec, events_of(codec, batch))
-        for role, group, signal, factor in [
-            ("motor_speed", 61444, "EngineSpeed", RPM),
-            ("vehicle_speed", 65265, "WheelBasedVehicleSpeed", 1 / 3.6),
-        ]:
-            data = [data for _, identifier, data, _ in batch if identifier & EFF_FLAG and pgn(identifier) == group]
-            decoded = [float(messages[group].decode_simple(d)[signal]) for d in data]  # type: ignore[arg-type]
-            limit = messages[group].get_signal_by_name(signal).maximum
-            truth = [value * factor if value <= limit else None for value in decoded]  # type: ignore[operator]
-            assert [value for _, value in found.get(role, [])] == pytest.approx(truth)
-            compared[role] += len(truth)
-    assert codec.received == count
-    assert compared["motor_speed"] == speeds
-    assert all(reason == NOT_AVAILABLE for _, reason in codec.faults)
-
-
 # --- whole-second stamps and an empty line -------------------------------------------------------------------------
 
 
-def test_real_frames_with_stamps_of_whole_seconds(tmp_path):
-    log = real("can_logs", "savvycan_example_candump_1s_stamps.log")
-    damages: list[LogDamage] = []
-    frames = [frame for batch in read_frames(log, on_damage=damages.append) for frame in batch]
-    assert damages == []  # an empty line is no damage
-    lines = [line for line in log.read_text().splitlines() if line.strip()]
-    assert len(frames) == len(lines)
-    # The signals of this car are not known: every byte of its three busiest messages plays some role that may be 255.
-    busiest = [identifier for identifier, _ in Counter(f[1] for f in frames if len(f[2]) == 8).most_common(3)]
-    parts = ['VERSION "1"', "NS_ :", "BS_:", "BU_: A"]
-    for identifier in busiest:
-        parts.append(f"BO_ {identifier} M{identifier}: 8 A")
-        parts += [f' SG_ S{identifier}_{i} : {8 * i}|8@1+ (1,0) [0|255] "" A' for i in range(8)]
-    (tmp_path / "v.dbc").write_text("\n".join(parts) + "\n")
-    roles = [role for role, unit in ROLES.items() if PLAUSIBLE[unit][1] >= 255][:24]
-    text = "dbc = ['v.dbc']\n[bus]\nnot_available = 'none'\n[roles]\n"
-    for n, role in enumerate(roles):
-        text += f'{role} = {{ signal = "S{busiest[n // 8]}_{n % 8}", unit = "{ROLES[role]}" }}\n'
-    (tmp_path / "v.toml").write_text(text)
-    codec = Codec(read_mapping(Table.read(tmp_path / "v.toml")))
-    events = events_of(codec, frames)
-    wanted = [frame for frame in frames if frame[1] in busiest]
-    assert [tuple(int(v) for v in numbers if v is not None) for _, _, numbers in events] == [
-        tuple(f[2]) for f in wanted
-    ]
-    assert [time for time, _, _ in events] == [(f[0] - frames[0][0]) / 1e9 for f in wanted]
-    assert not codec.faults
-    assert sum(codec.unknown.values()) == len(frames) - len(wanted)
-
-
 # --- a car whose rides are real and whose frames are made here -------------------------------------------------------
-
-
-@pytest.mark.parametrize("trip", ["TripA01", "TripA05", "TripA08"])
-def test_i3_real_trips_end_where_the_car_says(trip):
-    path = real("ev_bmw_i3_trips", f"{trip}_2hz.csv.gz")
-    i3, drawn, truth = vehicle("i3"), 0.0, 0.0
-    database, pipeline = i3.mapping.database, Pipeline(i3)
-    row: dict[str, float] = {}
-    with gzip.open(path, "rt") as file:
-        for text in csv.DictReader(file):
-            row = {name: float(value or "nan") for name, value in text.items()}
-            if not all(map(math.isfinite, row.values())):
-                continue
-            battery = {"Voltage": row["v_batt_V"], "Current": row["i_batt_A"], "Temperature": row["t_batt_C"]}
-            data = {f"Battery{name}": value for name, value in (battery | {"Charge": row["soc_pct"]}).items()}
-            motion = {"Speed": max(row["v_kmh"], 0.0), "AccelX": row["ax_mps2"], "Torque": row["torque_Nm"]}
-            motion["OutsideTemperature"] = row["t_amb_C"]
-            now = round(row["t_s"] * 1e9)
-            frames: list[Frame] = [
-                (now, 256, database.encode_message("Battery", data, padding=True), 0),
-                (now + MS, 257, database.encode_message("Motion", motion, padding=True), 0),
-            ]
-            pipeline.advance(frames, now + MS)
-            truth -= row["v_batt_V"] * row["i_batt_A"] * 0.5
-            last = pipeline.last
-            if last is not None and last.pack_voltage and last.pack_current is not None:
-                drawn += last.pack_voltage * last.pack_current * 0.5
-    assert pipeline.counts().dropped == pipeline.counts().implausible == 0
-    assert drawn == pytest.approx(truth, rel=0.02)
-    end = pipeline.last
-    assert end is not None and end.soc is not None and end.range is not None
-    assert end.state is State.VALID and not end.distrusted
-    assert end.soc == pytest.approx(row["soc_pct"] / 100, abs=0.03)

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.can.dbc import find_dbc, load_database
-from gz_onboard.can.mapping import pgn
 from gz_onboard.can.publisher import Counts, Publisher
 from gz_onboard.cli import main
 from gz_onboard.daemon.command import summary
@@ -143,14 +142,6 @@ def test_identifiers_of_ones_own(number, identifiers, tmp_path):
         identifiers[1] & ~EFF_FLAG, next(f[2] for f in reversed(run.sent) if f[1] == identifiers[1])
     )
     assert energy["RANGE_EnergyLeft"] == pytest.approx(estimate.energy_left / 3600, rel=0.02)  # type: ignore[call-overload, operator]
-
-
-def test_by_parameter_group_each_own_frame_has_its_own(tmp_path):
-    roles = '[bus]\nidentifiers = "j1939"\n'
-    file = van(tmp_path, "range_identifier = 0x18FF6022", parallel=12).file
-    file.write_text(file.read_text(encoding="utf-8").replace("[bus]\n", roles), encoding="utf-8")
-    publisher = Pipeline(read_vehicle(str(file))).publisher
-    assert {pgn(identifier & ~EFF_FLAG) for identifier in publisher.identifiers} == set(range(0xFF60, 0xFF68))
 
 
 @pytest.mark.parametrize("number", ["-1", "0x7FC", "0x7FF", "0x1FFFFFFD", "1.5", '"0x600"'])

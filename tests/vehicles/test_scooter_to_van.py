@@ -24,7 +24,8 @@ from tests.support import ROOT
 
 STEP = 0.1  # s
 GRAVITY, AIR = 9.81, 1.2  # m/s², kg/m³
-OCV = ((0.0, 3.0), (0.1, 3.45), (0.2, 3.55), (0.5, 3.7), (0.8, 3.96), (1.0, 4.18))  # V over SOC
+Points = tuple[tuple[float, float], ...]
+OCV: Points = ((0.0, 3.0), (0.1, 3.45), (0.2, 3.55), (0.5, 3.7), (0.8, 3.96), (1.0, 4.18))  # V over SOC
 
 DBC = """VERSION ""
 NS_ :
@@ -110,7 +111,7 @@ class Build:
 
     def energy(self, soc: float) -> float:
         """J that come out slowly from `soc` on."""
-        points = [*(p for p in OCV if p[0] < soc), (soc, rest_voltage(soc))]
+        points = [*(p for p in OCV if p[0] < soc), (soc, cell(self).rest(soc))]
         volts = sum((u0 + u1) / 2 * (s1 - s0) for (s0, u0), (s1, u1) in pairwise(points))
         return volts * self.series * self.parallel * self.capacity * 3600
 
@@ -129,20 +130,28 @@ BUILDS = {
 }
 
 
-def rest_voltage(soc: float) -> float:
-    """V of a cell."""
-    (s0, u0), (s1, u1) = next((a, b) for a, b in pairwise(OCV) if soc <= b[0])
-    return u0 + (soc - s0) * (u1 - u0) / (s1 - s0)
+@dataclass(frozen=True)
+class Cell:
+    """One cell: rest voltage over SOC, R0 and R1 [ohm], and how fast it relaxes [s]."""
+
+    ocv: Points
+    r0: float
+    r1: float
+    relaxation: float
+
+    def rest(self, soc: float) -> float:
+        """V."""
+        (s0, u0), (s1, u1) = next((a, b) for a, b in pairwise(self.ocv) if soc <= b[0])
+        return u0 + (soc - s0) * (u1 - u0) / (s1 - s0)
 
 
-def cell(build: Build) -> tuple[float, float, float]:
-    """(R0, R1 [ohm], C1 [F]): a drop of 6 % at 1 C, and 20 s."""
-    r0, r1 = 0.1 / build.capacity, 0.04 / build.capacity
-    return r0, r1, 20.0 / r1
+def cell(build: Build) -> Cell:
+    """A drop of 6 % at 1 C, and 20 s."""
+    return Cell(OCV, 0.1 / build.capacity, 0.04 / build.capacity, 20.0)
 
 
 def write(folder: Path, build: Build) -> Path:
-    r0, r1, c1 = cell(build)
+    r0, r1, c1 = cell(build).r0, cell(build).r1, cell(build).relaxation / cell(build).r1
     values = vars(build) | {"socs": [s for s, _ in OCV], "volts": [v for _, v in OCV], "r0": r0, "r1": r1, "c1": c1}
     (folder / "bus.dbc").write_text(DBC, encoding="utf-8")
     file = folder / f"{build.name}.toml"
@@ -178,11 +187,10 @@ def encode(database: Database, name: str, **values: float) -> bytes:
     return database.encode_message(name, values, padding=True)
 
 
-def drive(
-    build: Build, database: Database, truth: Truth, duration: float, efficiency: float = 0.9
-) -> Iterator[list[Frame]]:
-    """The frames of a drive: road load over an efficiency, an RC cell; what they say, they say as the DBC can."""
-    r0, r1, c1 = cell(build)
+def driven(
+    build: Build, truth: Truth, duration: float, cell: Cell, efficiency: float = 0.9
+) -> Iterator[tuple[int, float, float, float]]:
+    """(time [ns], speed [m/s], voltage, current of the pack) of a drive: road load over an efficiency, an RC cell."""
     mass, v1, before = build.mass + build.payload, 0.0, 0.0
     for i, v in enumerate(speeds(build, duration)):
         mean, a = (v + before) / 2, (v - before) / STEP
@@ -190,14 +198,19 @@ def drive(
         force = mass * a + (0.011 * mass * GRAVITY + 0.5 * AIR * build.drag * mean * mean) * (mean > 0)
         wheel = force * mean
         power = build.auxiliary + (wheel / efficiency if wheel > 0 else 0.5 * wheel)
-        inside, source = build.series * r0 / build.parallel, build.series * (rest_voltage(truth.soc) - v1)
+        inside, source = build.series * cell.r0 / build.parallel, build.series * (cell.rest(truth.soc) - v1)
         current = (source - (source * source - 4 * inside * power) ** 0.5) / (2 * inside)
         volts = source - inside * current
         truth.soc -= current / build.parallel * STEP / 3600 / build.capacity
-        v1 += STEP / (r1 * c1) * (r1 * current / build.parallel - v1)
+        v1 += STEP / cell.relaxation * (cell.r1 * current / build.parallel - v1)
         truth.energy += volts * current * STEP
         truth.distance += mean * STEP
-        ns = round(i * STEP * 1e9)
+        yield round(i * STEP * 1e9), v, volts, current
+
+
+def drive(build: Build, database: Database, truth: Truth, duration: float) -> Iterator[list[Frame]]:
+    """The frames of a drive; what they say, they say as the DBC can."""
+    for ns, v, volts, current in driven(build, truth, duration, cell(build)):
         battery = encode(database, "Battery", Voltage=volts, Current=current, Cells=25.0, Outside=20.0)
         rpm = v / build.radius / build.gear * 60 / (2 * pi)
         yield [(ns, 256, battery, 0), (ns + 1, 257, encode(database, "Drive", Speed=3.6 * v, Motor=rpm), 0)]

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.events import Group
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
-from tests.events import EventEstimator
 from tests.vehicles.test_scooter_to_van import BUILDS, Build, Truth, drive, write
 
 LOW, HIGH = 0.1, 0.85
@@ -51,16 +49,6 @@ def test_below_the_window_there_is_no_range(pack, tmp_path):
         pipeline.advance(frames, frames[0][0])
     assert pipeline.last
     assert pipeline.last.soc == pipeline.last.range == 0.0
-
-
-def test_the_vehicles_own_state_of_charge_is_that_of_the_window(tmp_path):
-    """What it shows sinks by 20 %: of its cells' charge, 15 % have gone."""
-    vehicle = vehicle_of(tmp_path, PACKS["7 cells"])
-    group = Group("Battery", ("bms_state_of_charge", "pack_voltage"), 0.1)
-    e = EventEstimator([group], vehicle.pack, vehicle.model, vehicle.riding)
-    e.handle((0.0, 0, (0.8, 26.0)))
-    e.close()
-    assert e.signals.bms_state_of_charge.value == pytest.approx(LOW + 0.8 * (HIGH - LOW))
 
 
 @pytest.mark.parametrize(
