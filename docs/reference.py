@@ -15,8 +15,8 @@ import cantools
 from cantools.database.can import Message
 
 from gz_onboard.calibration import report
-from gz_onboard.calibration.command import plain_options
 from gz_onboard.calibration.procedures import PROCEDURES
+from gz_onboard.calibration.steps import number_options
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.discovery.judgement import VERSION as DISCOVER_VERSION
 from gz_onboard.discovery.judgement import Report
@@ -54,7 +54,7 @@ def commands() -> Iterator[str]:
         for slot, data in procedure.slots.items():
             key = "`DATA`" if slot == "data" else f"`--with {slot}=FILE`"
             yield f"  - {key}: {data.what}{'' if data.least else ' (optional)'}"
-        yield from (f"  - `--set {option}={value}`" for option, value in plain_options(procedure).items())
+        yield from (f"  - `--set {option}={value}`" for option, value in number_options(name).items())
     yield "\n## Keys of JSON results"
     for of, version, keys in RESULTS:
         yield f"\n### {of}\n\nVersion {version}.\n"

@@ -19,10 +19,10 @@ from gz_onboard import priors
 from gz_onboard import state as state_files
 from gz_onboard import vehicle as vehicle_files
 from gz_onboard.arguments import checked, within
-from gz_onboard.calibration import command as calibration
 from gz_onboard.calibration import report as calibration_report
+from gz_onboard.calibration import steps as calibration
 from gz_onboard.calibration.result import Result
-from gz_onboard.calibration.vehicle_file import vehicle_output, write_vehicle
+from gz_onboard.calibration.vehicle_file import vehicle_output
 from gz_onboard.daemon import learned
 from gz_onboard.discovery import baseline as baselines
 from gz_onboard.discovery import report as discovery_report
@@ -703,7 +703,7 @@ class Calibration(Tabular):
         """Write the vehicle file with the results, and return the vehicle in it. Raises InputError."""
         vehicle_output(Path(file), [self.base, *self.read])
         with writing(file):
-            return write_vehicle(self.base, calibration.for_file(self.results, read_vehicle(self.base)), Path(file))
+            return calibration.write_calibration(self.base, self.results, Path(file))
 
     @checked
     def write_report(self, file: PathLike) -> None:
@@ -729,19 +729,19 @@ def calibrate(
     slots, such as ``{"data": [...], "held_out": [...]}``. vehicle: name or file to start from, ``reference`` or that
     of the manifest if None. progress: takes each part of the work that begins. Raises InputError.
     """
-    calibration.known_procedure(procedure)
+    calibration.check_procedure(procedure)
     slots = data if isinstance(data, Mapping) else {"data": _paths(data)}
     files = {slot: _paths(group) for slot, group in slots.items()}
     start = None if vehicle is None else _file(vehicle)
     if procedure == "all":
         if options:
             raise InputError("the procedure all takes its options from the manifest")
-        base, steps = calibration.asked_of_manifest(files.get("data", []), start)
+        base, steps = calibration.read_manifest(files.get("data", []), start)
     else:
         base = find_vehicle("reference" if start is None else start)
         texts = [f"{name}={value}" for name, value in (options or {}).items()]
-        steps = [calibration.step_of(procedure, files, calibration.options_of(texts, procedure))]
-    found = calibration.calibrate(steps, base, progress or (lambda _: None))
+        steps = [calibration.step_of(procedure, files, texts)]
+    found = calibration.run_steps(steps, base, progress or (lambda _: None))
     return Calibration(base, [result for result, _ in found], calibration.files_of(steps, files.get("data", [])))
 
 

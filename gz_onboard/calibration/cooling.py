@@ -15,7 +15,6 @@ import numpy as np
 
 from gz_onboard.arrays import Array, held_integral
 from gz_onboard.calibration.fit import Solution, nonlinear, score
-from gz_onboard.calibration.manifest import AIRFLOWS
 from gz_onboard.calibration.result import Curve, Panel, PlotLine, Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.constants import BENCH_TEMPERATURE
@@ -51,6 +50,7 @@ class CoolingConfig:
 
 
 CONFIG = CoolingConfig()
+AIRFLOWS = {"none": 0.0, "wheel": 1.0}  # air over the wheel's speed: a closed room; riding, or a fan that follows
 SENSORS = tuple(f"{part}_temperature" for part in ("motor", "inverter", "inverter_box", "cell", "bms"))
 ENTROPY_SOC = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)  # nodes as fine as rides of a tenth of the charge can tell
 ENTROPY = tuple(f"entropy_{soc:g}" for soc in ENTROPY_SOC)  # change of a cell's voltage with temperature there

@@ -10,13 +10,43 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.calibration import cell, coastdown, cooling, motor, pulse, sensors
-from gz_onboard.calibration.manifest import Option, Slot
 from gz_onboard.calibration.result import Curve, Found, Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
 from gz_onboard.recording.recording import Recording, ride_name
 from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
+
+Option = float | Mapping[str, float | str]
+"""A number, or by the name of a file the air that moves past the vehicle: a number [m/s] or one of `cooling.AIRFLOWS`.
+"""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """The files of one kind that a procedure takes.
+
+    kind: "table", "ride", or "any": CSV and Parquet are tables then. least: of files, 0 for a slot that may be left
+    out. most: None for any number.
+    """
+
+    kind: str
+    what: str
+    least: int = 0
+    most: int | None = None
+
+    def check(self, procedure: str, slot: str, count: int) -> None:
+        """InputError for too few or too many files."""
+        if count < self.least:
+            raise InputError(f"{procedure} needs {self.what} ({slot}: {self.least} or more), has {count}")
+        if self.most is not None and count > self.most:
+            raise InputError(f"{procedure} takes {self.most} for {slot} ({self.what}), has {count}")
+
+    def is_table(self, file: Path) -> bool:
+        """Whether `file` is read as a table, not as a ride."""
+        if self.kind != "any":
+            return self.kind == "table"
+        return file.name.endswith((".csv", ".csv.gz", ".parquet", ".pq"))
 
 
 @dataclass
@@ -38,7 +68,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Procedure:
-    """A row of the registry: what it takes and how its pure function is called."""
+    """What a procedure does, the files it takes by slot, how it is run, and its options with their defaults."""
 
     what: str
     slots: Mapping[str, Slot]

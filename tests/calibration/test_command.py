@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.command import for_file
 from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.calibration.result import Curve, Found, Result
+from gz_onboard.calibration.steps import write_calibration
 from gz_onboard.cli import main
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import OWN, read_vehicle
 
 LOGS = Path(__file__).parents[2] / "replay_logs"
 DATA = LOGS / "calibration"
@@ -113,7 +113,7 @@ def test_a_folder_of_rides_is_its_logs(tmp_path, capsys):
         (["motor", "motor_dyno.csv.gz", "--vehicle", "refrence"], r"no such vehicle file; .*did you mean 'reference'"),
         (["all", "..", ".."], "all takes one folder"),
         (["wheel", "../../dbc"], "dbc: this folder holds no log"),
-        (["all", "..", "--held-out", "x"], "from the manifest"),
+        (["all", "..", "--with", "held_out=x"], "from the manifest"),
         (["all", ".."], "takes a folder with a manifest calibration.toml"),
     ],
 )
@@ -139,16 +139,14 @@ def test_help_names_every_procedure(capsys):
     assert all(f"  {name}" in told for name in PROCEDURES)
 
 
-def test_only_what_a_vehicle_file_holds_is_written():
-    one = np.array([1.0])
+def test_only_what_a_vehicle_file_holds_is_written(tmp_path):
+    one, pair = np.array([1.0]), np.array([[1.0, 0.5], [0.5, 2.0]])
     result = Result(
         "t",
         {"drag_area": Found(0.5, 0.1, "m²", "x"), "wind": Found(1, 1, "m/s", "x")},
-        {"battery.r0": Curve({"soc": one}, one, one, "ohm", "x"), "slow_r0": Curve({"soc": one}, one, one, "ohm", "x")},
-        [(("wind", "drag_area"), np.array([[1.0, 0.5], [0.5, 2.0]]))],
+        {"slow_r0": Curve({"soc": one}, one, one, "ohm", "x")},
+        [(("wind", "drag_area"), pair)],
     )
-    (kept,) = for_file([result], read_vehicle("reference"))
-    assert list(kept.parameters) == ["drag_area"]
-    assert list(kept.curves) == ["battery.r0"]
-    assert kept.covariance[0][0] == ("drag_area",)
-    assert kept.covariance[0][1].tolist() == [[2.0]]
+    written = tmp_path / "v.toml"
+    assert write_calibration(OWN / "reference.toml", [result], written).parameters["drag_area"] == 0.5
+    assert not re.search(r"\bwind =|slow_r0", written.read_text())

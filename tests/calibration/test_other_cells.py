@@ -11,10 +11,9 @@ import pytest
 
 from gz_onboard.calibration import cell as bench
 from gz_onboard.calibration import pulse
-from gz_onboard.calibration.command import for_file
 from gz_onboard.calibration.result import Curve, Found, Result
+from gz_onboard.calibration.steps import write_calibration
 from gz_onboard.calibration.table import Measurements
-from gz_onboard.calibration.vehicle_file import write_vehicle
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import OWN, read_vehicle
@@ -40,7 +39,7 @@ def flat_test(hours=20, cell=None):
 
 def written(folder, *results):
     file = folder / "v.toml"
-    write_vehicle(REFERENCE, for_file(results, read_vehicle(REFERENCE)), file)
+    write_calibration(REFERENCE, results, file)
     return read_vehicle(file)
 
 
@@ -80,9 +79,9 @@ def test_one_pulse_test_of_a_cell_without_relaxation(tmp_path):
 def test_a_shift_of_another_cell_goes_with_its_curve(tmp_path):
     shift = Curve({"temperature": np.array([0.0, 25.0])}, np.array([-0.02, 0.0]), np.full(2, 0.005), "V", "old cell")
     base = tmp_path / "base.toml"
-    write_vehicle(REFERENCE, [Result("t", curves={"battery.rest_shift": shift})], base)
+    write_calibration(REFERENCE, [Result("t", curves={"battery.rest_shift": shift})], base)
     assert read_vehicle(base).pack.rest_shift_curve
-    write_vehicle(base, for_file([bench.open_circuit(slow_test()[0])], read_vehicle(base)), base)
+    write_calibration(base, [bench.open_circuit(slow_test()[0])], base)
     assert not read_vehicle(base).pack.rest_shift_curve
 
 
@@ -98,7 +97,7 @@ def test_a_file_that_could_not_be_read_leaves_the_old_one_and_a_report(tmp_path,
     assert main(["calibrate", "ocv", file, "--output", str(out), "--report", str(page), "--quiet"]) == 2
     said = capsys.readouterr()
     assert re.search(
-        r"v.toml:[0-9]+: battery.ocv.value: must increase, but 3.14196 follows 3.14196; that was found", said.err
+        r"v.toml:[0-9]+: battery.ocv.value: must increase, but 3.14196 follows 3.14196; this value was found", said.err
     )
     assert "battery.ocv.value: must increase" in page.read_text()
     assert f"{page} written" in said.out

@@ -16,8 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gz_onboard.calibration.manifest import read_manifest
-from gz_onboard.calibration.procedures import PROCEDURES
+from gz_onboard.calibration.steps import read_manifest
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.model.battery import Battery
@@ -349,9 +348,7 @@ def read_it(folder: Path, kind: str, rng: random.Random) -> tuple[Path, set[str]
 
     def read() -> None:
         if kind == "manifest":
-            read_manifest(
-                folder, {n: p.slots for n, p in PROCEDURES.items()}, {n: p.options for n, p in PROCEDURES.items()}
-            )
+            read_manifest([folder])
             return
         vehicle = read_vehicle(folder / "v.toml")
         for problem in problems(vehicle):
