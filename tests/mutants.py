@@ -35,7 +35,14 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "battery": (
         ("estimator/battery_filter.py", "estimator/battery_pack.py", "estimator/battery_priors.py", "model/battery.py"),
-        ("tests/estimator/test_battery_filter.py", "tests/model/test_battery.py", "tests/estimator/test_voltages.py"),
+        (
+            "tests/estimator/test_battery_filter.py",
+            "tests/model/test_battery.py",
+            "tests/estimator/test_parts.py",
+            "tests/estimator/test_start_riding.py",
+            "tests/estimator/test_voltages.py",
+            "tests/estimator/test_life.py",
+        ),
     ),
     "plausibility": (
         (

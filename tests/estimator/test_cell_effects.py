@@ -32,6 +32,16 @@ def test_a_current_that_has_just_begun_takes_no_more_than_has_built_up():
         assert effects.supposed("pack", DT * (k + 1), HARD) == pytest.approx(truth, abs=2e-3)
 
 
+def test_a_current_that_is_long_another_than_the_one_followed_has_its_own_overpotential():
+    """The pack's sensor is stuck at nothing for half a minute, the inverter's shows what flows."""
+    effects, _ = followed([0.0] * 10)
+    for k in range(300):
+        effects.step(PACK, DT, 0.0, SOC, COLD)
+        shown = effects.supposed("inverter", DT * k, HARD)
+    assert effects.overpotential == pytest.approx(0.0, abs=1e-9)
+    assert shown == pytest.approx(followed([HARD] * 400)[1][-1], rel=0.01)
+
+
 def test_a_resistance_learned_from_quick_changes_says_nothing_of_what_takes_half_an_hour():
     """The reaction of a cell with half as much resistance more loses more, and slow relaxation what the file says."""
     assert {"charge_transfer", "slow_relaxation"} <= {effect.name for effect in MODEL.effects}

@@ -12,7 +12,7 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, Ledger
 from gz_onboard.model.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
-from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
+from tests.estimator.life import CELLS, GROUPS, MOTOR, PACK, Scooter
 from tests.events import EventEstimator
 from tests.support import joined, without_cell_effects
 
@@ -29,11 +29,11 @@ def estimator(vehicle: Vehicle) -> EventEstimator:
     return EventEstimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
 
 
-def run(vehicle, seconds, change=lambda events: events, plant=None):
+def run(vehicle, seconds, change=lambda events: events):
     """(estimator, the innovations [V] after the first minute)."""
     e = estimator(vehicle)
     innovations, due = [], 60.0
-    for event in change(event for event, _ in (plant or Plant(offset=0.0)).ride(seconds)):
+    for event in change(Scooter(offset=0.0, period=0.1).live(seconds, 9.0)):
         e.handle(event)
         if event[0] >= due:
             due += 0.5
@@ -81,7 +81,7 @@ def slow_plant(resistance, seconds=700.0):
         cell = current / battery.cells_parallel
         volts = battery.ocv(soc)[0] - battery.r0.at(soc, 25.0)[0] * cell - fast - slow
         pack = battery.cells_series * volts - battery.series_resistance * current
-        yield t, PACK, (pack, p["pack_current_gain"] * current + p["pack_current_offset"])
+        yield t, PACK, (pack, p["pack_current_gain"] * current + p["pack_current_offset"], None)
         yield t + 0.01, MOTOR, (0.0 if t < 3 else 20.0,)
         if step % 10 == 0:
             yield t + 0.02, CELLS, (25.0, 20.0)
@@ -165,7 +165,7 @@ def shifted(voltage_late):
         for time, group, values in events:
             if group == PACK:
                 other = packs[min(max(index[time] - voltage_late, 0), len(packs) - 1)]
-                yield time, group, (other[2][0], values[1])
+                yield time, group, (other[2][0], *values[1:])
             else:
                 yield time, group, values
 

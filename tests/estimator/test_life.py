@@ -7,6 +7,7 @@ from math import exp
 
 import pytest
 
+from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
     BATTERY,
@@ -136,6 +137,50 @@ def test_a_voltage_overrules_a_capacity_that_was_learned_and_is_wrong(learned, t
     assert worst(rows) < 3
 
 
+# --- a ride ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_true_state_of_charge_is_within_three_sd_all_the_way(seed):
+    scooter, e = Scooter(seed=seed, soc=0.35 + 0.15 * seed, offset=0.1), estimator()
+    rows = follow(e, scooter.live(900, 9.0), scooter)
+    assert worst(rows) < 3
+    assert rows[-1][1].soc_sd < 0.03
+    assert rows[-1][1].state is State.VALID
+
+
+def test_half_an_hour_of_riding_corrects_a_start_20_percent_off():
+    scooter, e = Scooter(soc=0.7, offset=0.0), estimator()
+    follow(e, scooter.live(2), scooter)
+    e.pack.state = with_soc(e.pack.state, e.pack.state.soc - 0.2, 0.1**2)
+    true, end = follow(e, scooter.live(1800, 9.0), scooter)[-1]
+    assert abs(end.soc - true) < 0.05
+
+
+def test_the_same_events_give_the_same_bits():
+    a, b = (follow(estimator(), scooter.live(120, 9.0), scooter) for scooter in (Scooter(), Scooter()))
+    assert a == b
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ({"version": 99}, "version"),
+        ({"key": "other"}, "other"),
+        ({"soc": 7.0}, "not from 0 to 1"),
+        ({"soc_variance": 2e-9}, "impossible"),
+        ({"soc_variance": None}, "damaged"),
+        ({"riding": {}}, "damaged"),
+        ({"soc": float("nan")}, "state.soc is nan"),
+    ],
+)
+def test_a_snapshot_that_does_not_fit_is_refused(damage, said):
+    scooter, e = Scooter(), estimator()
+    follow(e, scooter.live(60, 9.0), scooter)
+    with pytest.raises(ValueError, match=said):
+        estimator().restore({**e.snapshot("key"), **damage}, "key", 5.0)
+
+
 # --- the first state of charge --------------------------------------------------------------------------------------
 
 
@@ -208,15 +253,16 @@ def test_cells_of_another_resistance_do_not_make_it_leave_a_right_estimate(resis
 
 # --- restarts -------------------------------------------------------------------------------------------------------
 
-AWAY = [
-    pytest.param(590, 10.0, 0.0, id="ridden 590 s"),
-    pytest.param(1200, 10.0, 0.0, id="ridden 1200 s"),
-    pytest.param(600, 0.0, 10.0, id="charged by 5 %"),
-    pytest.param(7200, 0.0, 3.5, id="charged for two hours"),
-    pytest.param(7200, 0.0, 0.0, id="parked"),
-    pytest.param(20, 11.0, 0.0, id="ridden 20 s"),
-    pytest.param(3, 11.0, 0.0, id="crashed"),
+AWAY = [  # s, m/s, A
+    (590, 10.0, 0.0),
+    (1200, 10.0, 0.0),
+    (600, 0.0, 10.0),  # charged by 5 %
+    (7200, 0.0, 3.5),
+    (7200, 0.0, 0.0),
+    (20, 11.0, 0.0),
+    (3, 11.0, 0.0),
 ]
+LESS_TOLD = [("all", False), ("neither", True), ("no own", True)]
 
 
 PACKS = pytest.mark.parametrize("make", [Scooter, flat_pack])
@@ -224,8 +270,13 @@ PACKS = pytest.mark.parametrize("make", [Scooter, flat_pack])
 
 
 @PACKS
-@pytest.mark.parametrize(("seconds", "speed", "charge"), AWAY)
-@pytest.mark.parametrize(("told", "clock"), [("all", True), ("all", False), ("neither", True), ("no own", True)])
+@pytest.mark.parametrize(
+    ("seconds", "speed", "charge", "told", "clock"),
+    [
+        *((*away, "all", True) for away in AWAY),
+        *((*away, told, clock) for away in AWAY[1:5:2] for told, clock in LESS_TOLD),
+    ],
+)
 def test_a_restart_knows_what_it_does_not_know(make, seconds, speed, charge, told, clock):
     tells = {"all": {}, "no own": {"own_soc": False}, "neither": {"own_soc": False, "odometer": False}}[told]
     scooter = make(soc=0.75)

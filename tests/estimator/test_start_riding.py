@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import exp
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from gz_onboard.estimator.battery_pack import PACK
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.events import Group
+from gz_onboard.model.effect import Port
 from gz_onboard.model.model import Model
 from gz_onboard.vehicle import read_vehicle
 from tests.events import EventEstimator
@@ -40,3 +42,21 @@ def test_at_full_speed_the_polarisation_is_that_of_full_speed():
         e.handle((i * 0.1 + 0.02, 0, (current, power / current)))
     assert e.pack.is_started
     assert e.pack.state.soc == pytest.approx(soc, abs=0.04)
+
+
+@pytest.mark.parametrize("guess", [0.0, 0.6])
+def test_a_series_resistance_that_r0_holds_already_does_not_hide_what_the_current_explains(guess):
+    """A vehicle of which only the voltage's drop is known: all of it is in r0, and a guess lies beside."""
+    vehicle = read_vehicle("reference", 75.0)
+    cells = vehicle.pack
+    r0 = cells.r0.at(0.6, 20.0)[0]
+    guessed = guess * r0 * cells.cells_series / cells.cells_parallel
+    groups = [Group("Pack", ("pack_current", "pack_voltage"), 0.1), Group("Cells", ("cell_temperature",), 1.0)]
+    effects = tuple(x for x in vehicle.model.effects if x.port is not Port.CELL_VOLTAGE)
+    model = Model(effects, vehicle.model.parameters)
+    e = EventEstimator(groups, replace(cells, series_resistance=guessed), model, vehicle.riding)
+    for i in range(300):
+        current = 40.0 if i // 20 % 2 else 5.0
+        e.handle((i * 0.1, 1, (20.0,)))
+        e.handle((i * 0.1 + 0.02, 0, (current, cells.cells_series * (3.75 - r0 * current / cells.cells_parallel))))
+    assert e.electrical.sag.explained

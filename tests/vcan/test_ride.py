@@ -119,14 +119,3 @@ def same(live: object, offline: object) -> bool:
     if not isinstance(live, float) or not isinstance(offline, float):
         return live == offline
     return bool(live == pytest.approx(offline, rel=1e-5, abs=1e-9))
-
-
-def test_it_agrees_with_the_ride_as_it_was_recorded(ride: Ride):
-    """Frames come with the jitter of the sender, and of a machine that has other things to do."""
-    offline = ridden(recorded("coastdown")).at(RIDE - 2)
-    near = [row for row in ride.daemon.estimates() if row["time"] is not None and RIDE - 5 < row["time"] < RIDE]
-    assert near
-    assert near[-1]["state"] == offline.state.name
-    assert near[-1]["soc"] == pytest.approx(offline.soc, abs=1.5e-3)
-    assert near[-1]["range"] == pytest.approx(offline.range, rel=0.02)
-    assert near[-1]["consumption_factor"] == pytest.approx(offline.consumption_factor, abs=0.02)
