@@ -334,6 +334,8 @@ def _is_missing(cell: object) -> bool:
 
 def _number(cell: Any) -> float:
     """Return the number in a cell: nan for an empty one, inf for anything else."""
+    if cell is None or (type(cell) is str and not cell):  # most cells of a table whose signals come at their own times
+        return math.nan
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
