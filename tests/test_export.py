@@ -175,17 +175,6 @@ def test_what_is_beyond_the_range_of_the_dbc_is_null_as_on_board(tmp_path: Path)
     assert values == {column_name(s): on_board[s.name] for s in message.signals}
 
 
-def test_tables_as_csv_say_the_same(tmp_path: Path, log: Path) -> None:
-    assert run(log, tmp_path / "tables", "--table-format", "csv") == 0
-    for message, rows in expected().items():
-        with (tmp_path / "tables" / f"{message}.csv").open(newline="") as stream:
-            there = list(csv.DictReader(stream))
-        assert [row.pop("time[s]").replace(".", "") for row in there] == [str(t) for t, _ in rows]
-        as_numbers = [{name: float(text) if text else None for name, text in row.items()} for row in there]
-        assert as_numbers == [{name: _near(value) for name, value in values.items()} for _, values in rows]
-        assert not any(len(text) > 8 for row in there for text in row.values())  # no 2.8000000000000003
-
-
 @pytest.mark.parametrize("name", ["out.parquet", "out.csv", "out.csv.gz"])
 def test_one_long_table_has_a_row_for_each_value(tmp_path: Path, log: Path, name: str) -> None:
     out = tmp_path / name
@@ -241,30 +230,6 @@ def test_an_mcap_has_a_channel_for_each_message_and_all_that_was_there(tmp_path:
     assert found["/estimate"] == [(t, v) for topic, t, v in read_samples(log) if topic == "/estimate"]
     assert read(out) == recorded()
     assert Counter(topic for topic, _, _ in read_samples(out))["/can/Pack"] == 201
-
-
-def test_the_comment_of_a_signal_stands_in_the_schema(tmp_path: Path, log: Path) -> None:
-    run(log, tmp_path / "out.mcap")
-    with (tmp_path / "out.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    schema = next(json.loads(s.data) for s in summary.schemas.values() if s.name == "Pack")
-    assert schema["properties"]["Voltage[V]"]["description"] == "V, at the contactor"
-
-
-def test_a_part_by_seconds_from_the_start(tmp_path: Path, log: Path) -> None:
-    run(log, tmp_path / "out.blf", "--from", "0.5", "--to", "1")
-    wanted = [frame for frame in recorded() if START + 500_000_000 <= frame[0] < START + 1_000_000_000]
-    assert [frame[1:] for frame in read(tmp_path / "out.blf")] == [frame[1:] for frame in wanted]
-    run(log, tmp_path / "out.mcap", "--from", "0.5", "--to", "1")
-    times = [t for _, t, _ in read_samples(tmp_path / "out.mcap")]
-    assert times
-    assert all(START + 500_000_000 <= t < START + 1_000_000_000 for t in times)
-
-
-def test_what_was_left_out_is_counted(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(log, tmp_path / "out.parquet")
-    assert "301 frames; 4 frames are in no DBC file, 1 do not fit theirs" in capsys.readouterr().out
 
 
 def test_damage_is_told(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -332,33 +297,6 @@ def test_columns_of_a_folder_may_be_of_any_of_its_tables(tmp_path: Path) -> None
         run(log, tmp_path / "none", "--columns", "sped")
 
 
-@pytest.mark.parametrize("name", ["out.csv.gz", "my.ride.asc.gz", "out.TRC.gz"])
-def test_frames_are_packed_under_any_name(tmp_path: Path, log: Path, name: str) -> None:
-    assert run(log, tmp_path / name, "--frames") == 0
-    there = [frame for batch in read_frames(tmp_path / name) for frame in batch]
-    assert [frame[1:3] for frame in there] == [frame[1:3] for frame in recorded()]
-    assert {file.name for file in tmp_path.iterdir()} == {"ride.mcap", name}
-
-
-def test_estimates_in_parquet(tmp_path: Path, estimated: Path) -> None:
-    pq = pytest.importorskip("pyarrow.parquet")
-    assert run(estimated, tmp_path / "out.parquet", "--from", "2", "--to", "5") == 0
-    table = pq.read_table(tmp_path / "out.parquet")
-    assert table.column_names == ["time", *COLUMNS]
-    assert table["range[m]"].to_pylist() == [998.0, None, 996.0]
-    assert table["state"].to_pylist() == ["VALID"] * 3
-
-
-def test_estimates_of_a_damaged_log_say_what_is_missing(
-    tmp_path: Path, estimated: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = estimated.read_bytes()
-    chunk = data.index(b"\x04\0\0\0zstd") - 28
-    estimated.write_bytes(data[: chunk + int.from_bytes(data[chunk - 8 : chunk], "little")])  # without its end
-    assert run(estimated, tmp_path / "out.csv") == 0
-    assert "damaged log: " in capsys.readouterr().out
-
-
 def test_estimates_beside_frames_are_asked_for(tmp_path: Path, log: Path) -> None:
     assert run(log, tmp_path / "out.csv", "--estimates") == 0
     with (tmp_path / "out.csv").open() as stream:
@@ -372,15 +310,6 @@ def test_a_log_of_estimates_has_no_frames_to_export(tmp_path: Path, estimated: P
     with pytest.raises(InputError, match=r"estimates can be written to .csv"):
         run(estimated, tmp_path / name)
     assert not (tmp_path / name).exists()
-
-
-def test_a_log_without_estimates_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    file = LogFile(path.open("wb"), START)
-    file.frames(recorded())
-    file.close()
-    with pytest.raises(InputError, match="holds no estimates"):
-        run(path, tmp_path / "out.csv", "--estimates")
 
 
 def test_a_log_without_dbc_files_asks_for_them(tmp_path: Path) -> None:
@@ -420,11 +349,6 @@ def test_nothing_half_written_has_the_name(
         run(log, tmp_path / name)
     assert (tmp_path / name).read_text() == "before"
     assert {file.name for file in tmp_path.iterdir()} == {"ride.mcap", name}
-
-
-def test_a_missing_directory_is_named(tmp_path: Path, log: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere.*cannot be written"):
-        run(log, tmp_path / "nowhere" / "out.blf")
 
 
 # --- what a log holds ------------------------------------------------------------------------------------------
@@ -505,23 +429,6 @@ def test_what_cannot_be_had_is_said(tmp_path: Path, log: Path, arguments: list[s
     assert not (tmp_path / arguments[0]).is_file()
 
 
-def test_a_log_of_frames_says_how_to_get_estimates(tmp_path: Path) -> None:
-    path = tmp_path / "a.log"
-    write_log(path, recorded())
-    with pytest.raises(InputError, match=r"holds no estimates.*it holds frames.*gz-onboard estimate a\.log"):
-        run(path, tmp_path / "out.csv", "--estimates")
-
-
-def test_the_vehicle_decodes_without_dbc_files(tmp_path: Path) -> None:
-    out = tmp_path / "out.jsonl"
-    with pytest.raises(InputError, match="--vehicle"):
-        run(LOGS / "coastdown.blf", out, "--to", "2")
-    assert run(LOGS / "coastdown.blf", out, "--to", "2", "--vehicle", "reference", "--columns", "BMS_PackVoltage") == 0
-    assert [50 < line["BMS_PackVoltage[V]"] < 60 for line in lines(out)] == [True] * 20
-    with pytest.raises(InputError, match="leave out --dbc"):
-        run(LOGS / "coastdown.blf", out, "--vehicle", "reference", "--dbc", "x.dbc")
-
-
 def test_the_vehicle_that_a_log_names_decodes_it(tmp_path: Path) -> None:
     path = tmp_path / "ride.mcap"
     file = LogFile(path.open("wb"), START, {"vehicle": read_vehicle("reference").name})
@@ -539,17 +446,6 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ride = ["estimate", str(LOGS / "coastdown.blf"), "--signals", "--no-plot", "--output", str(folder)]
     assert cli.main(ride) == 0
     return folder / "coastdown.estimate.mcap"
-
-
-def test_signals_that_a_log_has_decoded_are_found_without_frames(tmp_path: Path, own: Path) -> None:
-    assert run(own, tmp_path / "out.jsonl", "--signals", "--columns", "BMS_PackVoltage,BMS_PackCurrent") == 0
-    there = lines(tmp_path / "out.jsonl")
-    logged = [(t, v) for topic, t, v in read_samples(own) if topic == "/can/BMS_Pack"]
-    assert [line["BMS_PackVoltage[V]"] for line in there] == [_near(v["BMS_PackVoltage"]) for _, v in logged]
-    assert len(there) > 50
-    assert run(own, tmp_path / "part.jsonl", "--signals", "--from", "10", "--to", "20") == 0
-    part = [line for line in lines(tmp_path / "part.jsonl") if line["message"] == "BMS_Pack"]
-    assert len(part) == 10
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "jsonl"])
