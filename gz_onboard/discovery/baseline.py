@@ -1,4 +1,4 @@
-"""The baseline: what rides of the healthy vehicle show of it, how they differ, and the files that keep this."""
+"""The baseline: parameters and scatter by rides of the healthy vehicle, and the files that keep them."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ BASELINE = BaselineConfig()
 
 @dataclass(frozen=True)
 class Learned:
-    """What healthy rides taught.
+    """A model learned from healthy rides.
 
-    before: linearised there, with prior knowledge; after: with what they taught. lines: the rides there. folds: what is
-    learned without some of them, and which. usual_scatter (p,): variances between rides, in scales, before any.
+    before: linearised there, with prior knowledge; after: with theirs. lines: the rides there. folds: models learned
+    without some of them, and which these are. usual_scatter (p,): variances between rides, in scales, before any.
     """
 
     before: MixedModel
@@ -276,7 +276,7 @@ def check_held_out(learned: Learned) -> str:
 
 
 def restore(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
-    """What healthy rides taught of `vehicle`, or its file alone. folder: with effects of the user's own."""
+    """The model of `vehicle` by healthy rides, or by its file alone. folder: with effects of the user's own."""
     if isinstance(vehicle.healthy, MixedModel):
         return vehicle.healthy
     mixed = initial(vehicle, folder)
@@ -284,7 +284,7 @@ def restore(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
 
 
 def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
-    """Write `vehicle`, as `baseline` gave it, to `out` after the file `base`, its statistics beside it."""
+    """Write `vehicle`, as `baseline` gave it, to `out` after the file `base`, and its statistics next to it."""
     mixed = vehicle.healthy
     assert isinstance(mixed, MixedModel)
     known = {name: value for name, value in vehicle.parameters.known.items() if "refitted on" in value.source}
@@ -295,10 +295,10 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
 
 
 def saved_beside(mixed: MixedModel, out: Path) -> dict[tuple[str, ...], object]:
-    """Write the statistics of healthy rides beside the vehicle file `out`, and give the keys of it that name them."""
-    beside = out.with_suffix(".healthy.npz")
-    save(mixed, beside)
-    return {("healthy", "file"): beside.name, ("healthy", "rides"): int(mixed.healthy)}
+    """Write the statistics of healthy rides next to the vehicle file `out`; gives the keys of it that name them."""
+    file = out.with_suffix(".healthy.npz")
+    save(mixed, file)
+    return {("healthy", "file"): file.name, ("healthy", "rides"): int(mixed.healthy)}
 
 
 def accepted_into(mixed: MixedModel, found: Mapping[str, Found]) -> MixedModel:

@@ -1,4 +1,4 @@
-"""The channels: each a residual with its blocks, the sensors it needs, where it holds and what it depends on.
+"""The channels: each a residual with its blocks, the sensors it needs, where it holds, and its parameters.
 
 Each channel is an analytical redundancy relation (Gertler 1998; Krysander & Frisk 2008): a balance of one part of the
 vehicle whose inputs come from sensors, not from the model of another part. A fault in one part then shows in few
@@ -17,7 +17,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import COARSE, STEP, Ride
-from gz_onboard.discovery.residuals import System, Values
+from gz_onboard.discovery.residuals import WARMING, System, Values
 from gz_onboard.model.effect import ROAD_LOAD, Effect, Port
 
 ROLLING = 2.0  # m/s: above it the wheel rolls freely
@@ -331,7 +331,7 @@ CHANNELS = (
         "motor_temperature",
         "K",
         block=10.0,
-        steps=COARSE,
+        steps=WARMING,
         roles=("motor_temperature", "ambient_temperature"),
         fed_by=("motor_current",),
         residual=residuals.motor_temperature,
@@ -355,7 +355,7 @@ CHANNELS = (
         "inverter_temperature",
         "K",
         block=10.0,
-        steps=COARSE,
+        steps=WARMING,
         roles=("inverter_temperature", "ambient_temperature"),
         fed_by=("motor_current",),
         residual=residuals.inverter_temperature,
@@ -377,7 +377,7 @@ CHANNELS = (
         "cell_temperature",
         "K",
         block=10.0,
-        steps=COARSE,
+        steps=WARMING,
         roles=("cell_temperature", "ambient_temperature", "pack_voltage", "pack_current"),
         residual=residuals.cell_temperature,
         parameters=(

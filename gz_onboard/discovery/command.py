@@ -1,4 +1,4 @@
-"""``gz-onboard discover``: what rides show that the model of the vehicle does not, and why."""
+"""``gz-onboard discover``: differences between rides and the vehicle's model, and their causes."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         with writing(f"--baseline {arguments.baseline}"):
             write_baseline(healthy, vehicle.file, arguments.baseline)
-        beside = arguments.baseline.with_suffix(".healthy.npz").name
-        print(f"{arguments.baseline}: {vehicle.name} as healthy rides show it; their statistics are in {beside}")
+        file = arguments.baseline.with_suffix(".healthy.npz").name
+        print(f"{arguments.baseline}: {vehicle.name} as healthy rides show it; their statistics are in {file}")
         assert isinstance(healthy.healthy, MixedModel)
         print("\nnote: ".join([healthy.healthy.checked, *refused]))
         return 0
@@ -130,7 +130,7 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
     """The logs among `paths`, those of folders in the order of their names. InputError for none."""
     logs = logs_among(paths)
     if not logs:
-        raise InputError("no ride is given; gz-onboard discover --list prints what could be found in one")
+        raise InputError("no ride is given; gz-onboard discover --list prints the candidate causes")
     for log in logs:
         if not log.is_file():
             raise InputError(f"{log}: no such log{near_file(log)}")

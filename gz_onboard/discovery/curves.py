@@ -10,7 +10,15 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.grid import STEP, Ride, smooth
-from gz_onboard.discovery.mixed_model import HealthyCurve, LinearChannel, LinearRide, MixedModel, Population, Statistics
+from gz_onboard.discovery.mixed_model import (
+    HealthyCurve,
+    LinearChannel,
+    LinearRide,
+    MixedModel,
+    Population,
+    Statistics,
+    one_degree,
+)
 from gz_onboard.priors import USUAL_SIZES, Sizes
 
 CONSTANT = "constant"  # the quantity of a residual that is the same everywhere
@@ -28,7 +36,6 @@ KNOTS: dict[str, tuple[tuple[float, ...], str, str]] = {  # knots in a vehicle o
     "soc": ((0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0), "1", ""),
     "steering": ((-0.5, -0.2, -0.06, 0.0, 0.06, 0.2, 0.5), "rad", ""),
     "vibration": ((0.3, 0.7, 1.0, 1.4, 1.9, 2.5, 3.3), "m/s²", ""),
-    "suspension_speed": ((0.02, 0.06, 0.1, 0.14, 0.19, 0.25, 0.35), "m/s", ""),
     "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s", ""),
     CONSTANT: ((0.0,), "1", ""),
 }
@@ -46,8 +53,8 @@ CURVES: dict[str, tuple[float, float, tuple[str, ...]]] = {
     "pack_balance": (0.1, 0.3, ("speed", "pack_current", "motor_temperature", "time")),
     "cell_voltage": (0.005, 1.0, ("pack_current", "soc", "time", "current_change", "vibration")),
 }
-IN_PROPORTION = ("time", "current_change", "steering", "vibration", "suspension_speed")
-"""Quantities that something may be in proportion to and that no candidate is: each is a try of its own."""
+IN_PROPORTION = ("time", "current_change", "steering", "vibration")
+"""Quantities that a residual may be in proportion to and no candidate is: each counts as a try."""
 
 
 @dataclass(frozen=True)
@@ -159,11 +166,14 @@ def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> Populatio
 class CurveFit:
     """A curve that rides show. chi2: twice the rise of the log likelihood, with `k` degrees of freedom.
 
-    values (knots,) at the knots [the channel's unit]; covariance (knots, knots); weights (knots,): share of the rides
-    at each.
+    healthy_chi2: over the inflation of healthy rides; score: the same as of one degree of freedom. values (knots,): at
+    the knots [the channel's unit]; covariance (knots, knots); weights (knots,): share of the rides at each.
     """
 
+    form: CurveForm
     chi2: float
+    healthy_chi2: float
+    score: float
     k: int
     values: Array
     covariance: Array
@@ -222,7 +232,11 @@ def fit_curve(
     inner = free.T @ (shown_by.information + FITTING.ridge * np.eye(k)) @ free
     score = free.T @ shown_by.score
     estimate, at = np.linalg.solve(inner, score), form.basis @ free * form.size
-    return CurveFit(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, weights)
+    chi2, count = float(score @ estimate), free.shape[1]
+    healthy_chi2 = chi2 / (healthy.inflation if healthy else 1.0)
+    sure = one_degree(healthy_chi2, count, mixed.freedom)
+    covariance = at @ np.linalg.inv(inner) @ at.T
+    return CurveFit(form, chi2, healthy_chi2, sure, count, at @ estimate, covariance, weights)
 
 
 def healthy_curves(mixed: MixedModel, lines: Sequence[LinearRide]) -> dict[str, HealthyCurve]:

@@ -53,10 +53,10 @@ def term({arguments}, *, {name}_scale):
 def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discovery, list[str]]:
     """Write `vehicle` extended by the causes, or by a curve for a difference without a name, to `out`.
 
-    Gives the discovery with the file in its report, and sentences on what was done; no file is written without
-    anything to add. The statistics of healthy rides go along. Effects that are not the package's are copied into a
-    folder beside the file. What was missing in the vehicle file alone is part of its ``[forecast] factor``, measured
-    over modelled energy, and leaves it; a change since healthy rides is not. Raises InputError.
+    Gives the discovery with the file in its report, and sentences on the changes; no file is written without anything
+    to add. The statistics of healthy rides go along. Effects that are not the package's are copied into a folder next
+    to the file. A cause that the vehicle file alone does not know is part of its ``[forecast] factor``, measured over
+    modelled energy, and leaves it; a change since healthy rides is not. Raises InputError.
     """
     report, base, mixed = found.report, vehicle.file, found.search.mixed
     causes, unknown = [cause for cause in report.causes if not cause.varies], report.unknown
@@ -87,7 +87,7 @@ def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discover
             before = tomllib.loads(base.read_text(encoding="utf-8")).get("forecast", {}).get("source")
             source = f"{reason}; before: {before}" if before else reason
             keys |= {("forecast", "factor"): float(f"{value:.6g}"), ("forecast", "source"): source}
-            words.append(f"forecast factor {vehicle.riding.factor:g} to {value:.3g}: it included what was found")
+            words.append(f"forecast factor {vehicle.riding.factor:g} to {value:.3g}: it included these causes")
         if vehicle.healthy is not None:
             keys |= saved_beside(accepted_into(restore(vehicle), parameters), out)
         maker = f"gz-onboard discover --write-model, from {base.name}"
@@ -117,7 +117,7 @@ def extension(found: Discovery, causes: list[FoundCause]) -> tuple[dict[str, Fou
 def lowered_factor(
     found: Discovery, causes: list[FoundCause], vehicle: Vehicle, curve: bool
 ) -> tuple[float, str] | None:
-    """The forecast's factor without what the causes and the curve explain, and its source; None if it stays.
+    """The forecast's factor without the energy of causes and curve, and its source; None if it stays.
 
     factor = measured / modelled; the model now gives a share s of the measured energy more, so it becomes
     factor / (1 + s·factor).

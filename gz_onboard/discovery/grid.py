@@ -6,7 +6,7 @@ than three of its periods, the grid marks it as not measured.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -18,27 +18,27 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
 from gz_onboard.model.effect import MOVING, Port
 from gz_onboard.model.model import air_density
-from gz_onboard.model.sensors import grade_shown, true_current, true_voltage
-from gz_onboard.model.series import total
+from gz_onboard.model.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, grade_shown, true_current, true_voltage
+from gz_onboard.model.series import relaxation, total
 from gz_onboard.priors import sizes_of
 from gz_onboard.recording.recording import Recording
-from gz_onboard.recording.sensors import Vibration, road_speed, speed_role
+from gz_onboard.recording.sensors import road_speed, speed_role
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s
-COARSE = 5  # grid steps to one of the battery and cooling models: 0.5 s
+COARSE = 5  # grid steps to one of the model of the cells: 0.5 s
 
 
 @dataclass(frozen=True)
 class GridConfig:
-    """Limits of what the sensors show."""
+    """Limits of the sensors."""
 
     least_gap: float = 0.3  # s; a signal is missing after this and after three of its periods
     shortest: float = 60.0  # s of a ride
     least_samples: int = 20  # of a role
     standstill: float = 0.05  # m/s
     crawl: float = 1.0  # m/s: below, a steering angle or a motor torque is noise
-    brake_pressure: float = 0.8e5  # Pa: above what the sensors show at rest
+    brake_pressure: float = 0.8e5  # Pa: above the noise at rest
     regenerating: float = -1.0  # A of a motor of size 1: the brake is in use
     braked: float = -0.6  # m/s²: stronger deceleration than road load explains
     braking_margin: float = 0.5  # s to either side of braking
@@ -50,8 +50,6 @@ class GridConfig:
     steepest_lean: float = 0.85  # sine of the lean
     most_steering: float = 0.6  # rad
     rough_period: float = 0.034  # s: samples further apart do not show how rough a road is
-    suspension_mean: float = 2.0  # s
-    current_step: float = 10.0  # A in a vehicle of size 1 within half a second: the motor current changed
     longest_memory: float = 60.0  # s since an event: longer ago is as good as never
 
 
@@ -64,7 +62,6 @@ MEASURED_BY: Mapping[str, tuple[str, ...]] = {
     "steering": ("rate_z",),
     "motor_current": ("motor_current",),
     "current_change": ("motor_current",),
-    "since_change": ("motor_current",),
     "motor_temperature": ("motor_temperature",),
     "ambient_temperature": ("ambient_temperature",),
     "cell_temperature": ("cell_temperature",),
@@ -106,7 +103,7 @@ class Ride:
 
     @cached_property
     def coarse(self) -> dict[str, Array]:
-        """Signals and quantities averaged over steps of 0.5 s, for the battery and cooling models."""
+        """Signals and quantities averaged over steps of 0.5 s."""
         return {name: block_means(values, COARSE) for name, values in (self.signals | self.quantities).items()}
 
     def shows(self, quantity: str) -> bool:
@@ -242,10 +239,6 @@ def read_ride(samples: Recording, vehicle: Vehicle) -> Ride:
     if "pack_current" in signals:
         ride.quantities["pack_current"] = true_current(signals["pack_current"], p)
     ride.quantities["since_braking"] = since(ride.braking)
-    ride.quantities["since_change"] = since_change(ride.quantities["motor_current"] / ride.current_size)
-    wheels = [role for role in ("suspension_front", "suspension_rear") if role in columns]
-    if wheels and all(periods[role] < GRID.rough_period for role in wheels):
-        ride.quantities["suspension_speed"] = suspension_speed([columns[role] for role in wheels], grid)
     if periods.get("accel_z", np.inf) < GRID.rough_period:
         ride.quantities["vibration"] = vibration(*columns["accel_z"], grid)
     return ride
@@ -311,31 +304,12 @@ def since(happens: Mask) -> Array:
     return np.asarray(np.minimum((steps - last) * STEP, GRID.longest_memory))
 
 
-def since_change(current: Array) -> Array:
-    """Time [s] since `current` (n,), in a vehicle of size 1, changed by 10 A within half a second; a minute at most."""
-    before = np.concatenate([np.full(5, current[0]), current[:-5]])
-    return since(np.abs(current - before) > GRID.current_step)
-
-
 def vibration(times: Array, values: Array, grid: Array) -> Array:
     """Roughness of the road [m/s²] at `grid`, from vertical acceleration `values` at `times`; see `Vibration`."""
-    meter, rms = Vibration(), []
-    for dt, value in zip(np.diff(times, prepend=times[0]).tolist(), values.tolist(), strict=True):
-        meter.update(dt, value)
-        rms.append(meter.value)
-    return np.asarray(np.interp(grid, times, rms))
-
-
-def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array) -> Array:
-    """RMS speed [m/s] of the suspension over 2 s, all `wheels` together, at `grid`.
-
-    wheels: (times [s], travel [m]) of each.
-    """
-    square = np.zeros_like(grid)
-    for times, travel in wheels:
-        speed = np.gradient(travel, times)
-        square += averaged(times, speed * speed, grid, GRID.suspension_mean)
-    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+    steps = np.diff(times)
+    mean = relaxation(values[1:], np.exp(-steps / VIBRATION_PERIOD_S), float(values[0]))
+    square = relaxation((values[1:] - mean) ** 2, np.exp(-steps / VIBRATION_MEMORY_S))
+    return np.asarray(np.interp(grid, times[1:], np.sqrt(square)))
 
 
 def smooth(values: Array, seconds: float) -> Array:

@@ -1,9 +1,9 @@
-"""From the causes that a search found to a report: how sure, what could replace them, what has no name."""
+"""From the causes of a search to a report: certainty, replacements, differences without a name."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -32,7 +32,6 @@ from gz_onboard.discovery.search import (
     carries_over,
     held_out,
     improves,
-    one_degree,
     splits,
     with_observed_scatter,
     within_bounds,
@@ -45,7 +44,7 @@ VERDICTS = {
     "cause": "Fault identified",
     "none": "No fault found that these rides could show",
     "ambiguous": "Fault found, but these rides cannot tell which of several causes it is",
-    "unknown": "Fault found that is none of the candidates",
+    "unknown": "Fault found that no candidate explains",
     "inconclusive": "The model misses rides held out by more than healthy rides, and no cause explains it",
 }
 METRICS = {
@@ -73,10 +72,10 @@ class JudgementConfig:
     least_alternative: float = 0.4  # of the threshold, that a replacement must explain by itself
     margin: float = 6.0  # of chi-squared: a likelihood ratio of 20
     look_alike: float = 0.8  # cosine of two candidates
-    left: float = 0.1  # of the evidence for the causes: a curve beside them with less is the bend of a large effect
+    left: float = 0.1  # of the evidence for the causes: a further curve with less is the bend of a large effect
     unlike_left: float = 0.004  # the same where the curve contradicts them
     curve: float = 1.5  # evidence for a curve over that for a cause: its knots were chosen by eye
-    unlike: float = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not its bend
+    unlike: float = 0.5  # of a cause's effect in a channel: a curve that takes more is not its bend
     rival: float = 0.25  # of the evidence for the causes of its channel, likewise
     clear: float = 4.0  # standard deviations of a value of a curve
     own_share: float = 0.3  # of the evidence for a cause: a channel with more names it
@@ -212,7 +211,7 @@ class Strain:
 
 @dataclass(frozen=True)
 class Score:
-    """Score of a candidate beside the causes named."""
+    """Score of a candidate in addition to the causes named."""
 
     name: str
     score: float
@@ -306,7 +305,7 @@ class Report:
         "a difference without a name: channel, quantity, unit, straight (in proportion), share of the energy, curve "
         "[[at, value, sd], ...], denies (causes that it refutes); or null",
     ]
-    ranking: Annotated[list[Score], "name, score of every candidate beside the causes named"]
+    ranking: Annotated[list[Score], "name, score of every candidate in addition to the causes named"]
     residuals: Annotated[dict[str, ResidualSize], "per channel: mean, rms, autocorrelation, blocks, energy_share"]
     gain: Annotated[
         Gain,
@@ -315,7 +314,9 @@ class Report:
     ]
     extended_model: Annotated[str | None, "the vehicle file written, or null"] = field(default=None)
     advice: Annotated[list[str], "what to ride next"] = field(default_factory=list)
-    notes: Annotated[list[str], "what could not be used, and what was left out"] = field(default_factory=list)
+    notes: Annotated[list[str], "unusable rides, causes left out, outliers, missing sensors"] = field(
+        default_factory=list
+    )
     isolability: Annotated[
         Isolability,
         "signatures: channels of each candidate; look_alikes: pairs and the cosine of their effects on the residuals",
@@ -434,11 +435,11 @@ def errors(line: LinearRide, theta: Array) -> dict[str, float]:
 
 
 def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
-    """The curve that explains most beside the causes chosen, and which of them it refutes; None without one.
+    """The curve that explains most with the causes chosen, and which of them it refutes; None without one.
 
     A curve refutes causes if it takes back, or adds, half or more of their effect somewhere in a channel that names
-    them, if it has a quarter of their evidence beside them, if it explains much more than one of them in its place, or
-    if `constancy` finds one unequal. Other causes must then be significant without the refuted ones.
+    them, if it has a quarter of their evidence, if it explains much more than one of them in its place, or if
+    `constancy` finds one unequal. Other causes must then be significant without the refuted ones.
     """
     best = best_curve(now)
     if best is None or not best.denies:
@@ -456,52 +457,42 @@ def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
     return replace(best, denies=tuple(denied))
 
 
-def curves_beside(
-    now: Search, chosen: Sequence[str], forms: Sequence[CurveForm]
-) -> Iterator[tuple[CurveForm, CurveFit, float]]:
-    """Each of `forms` that the rides show beside the causes `chosen`, with its chi-squared on healthy rides."""
-    for form in forms:
-        curve = fit_curve(now.mixed, now.lines, form, now.index(chosen))
-        if curve is not None:
-            yield form, curve, healthy_chi2(now.mixed, form, curve)
+def curves_with(now: Search, chosen: Sequence[str], forms: Sequence[CurveForm]) -> list[CurveFit]:
+    """Those of `forms` that the rides show, fitted with the causes `chosen`."""
+    found = (fit_curve(now.mixed, now.lines, form, now.index(chosen)) for form in forms)
+    return [curve for curve in found if curve is not None]
 
 
-def healthy_chi2(mixed: MixedModel, form: CurveForm, curve: CurveFit) -> float:
-    """The chi-squared of a curve over its inflation on healthy rides."""
-    healthy = mixed.shapes.get(form.name)
-    return curve.chi2 / (healthy.inflation if healthy else 1.0)
-
-
-def is_significant(now: Search, form: CurveForm, curve: CurveFit) -> bool:
-    """Whether a curve has the score that it must have; a straight line counts as a try of its own instead."""
-    score = one_degree(healthy_chi2(now.mixed, form, curve), curve.k, now.mixed.freedom)
-    return score >= now.limit * (1.0 if form.straight else JUDGE.curve)
+def is_significant(now: Search, curve: CurveFit) -> bool:
+    """Whether a curve has the score that it must have; a straight line counts as a try instead."""
+    return curve.score >= now.limit * (1.0 if curve.form.straight else JUDGE.curve)
 
 
 def best_curve(now: Search) -> Unknown | None:
-    """The curve that explains most beside the causes chosen, and those of its channel if it is no bend of theirs."""
+    """The curve that explains most with the causes chosen, refuting those of its channel if it is no bend of theirs."""
     total, best = now.evidence.gain(now.index(now.chosen)), None
-    for form, curve, chi2 in curves_beside(now, now.chosen, curve_forms(now.mixed.system.sizes)):
-        if not is_significant(now, form, curve):
+    for curve in curves_with(now, now.chosen, curve_forms(now.mixed.system.sizes)):
+        if not is_significant(now, curve):
             continue
-        mine = [name for name in now.chosen if now.shares[name].get(form.channel, 0.0) > JUDGE.own_share]
+        channel = curve.form.channel
+        mine = [name for name in now.chosen if now.shares[name].get(channel, 0.0) > JUDGE.own_share]
         theirs = sum(now.part(now.chosen, name) for name in mine)
-        unlike = contradicts_causes(now, form, curve, chi2) or bool(mine and chi2 > JUDGE.rival * theirs)
+        unlike = contradicts_causes(now, curve) or bool(mine and curve.healthy_chi2 > JUDGE.rival * theirs)
         if now.chosen and curve.chi2 < (JUDGE.unlike_left if unlike else JUDGE.left) * total:
             continue
-        found = described(now, form, curve, mine if unlike else [])
-        if best is not None and (unlike, found.score) <= (bool(best.denies), best.score):
+        denied = mine if unlike else []
+        if best is not None and (unlike, curve.score) <= (bool(best.denies), best.score):
             continue
-        if is_accepted(now, form, [name for name in now.chosen if name not in found.denies]):
-            best = found
+        if is_accepted(now, curve.form, [name for name in now.chosen if name not in denied]):
+            best = described(now, curve, denied)
     return best
 
 
 def is_accepted(now: Search, form: CurveForm, rest: Sequence[str]) -> bool:
-    """Whether a curve beside the causes `rest` is more than these rides differ, and improves rides held out."""
+    """Whether a curve with the causes `rest` is more than these rides differ, and improves rides held out."""
     wide = with_observed_scatter(now.mixed, now.lines)
     curve = fit_curve(wide, now.lines, form, now.index(rest), own=True)
-    if curve is None or not is_significant(now, form, curve):
+    if curve is None or not is_significant(now, curve):
         return False
     causes = [now.causes[name] for name in rest]
     return len(now.lines) < 2 or improves(held_out(now.mixed, now.lines, causes, causes, form), {form.channel: 1.0})
@@ -515,18 +506,18 @@ def rival_curve(now: Search) -> Unknown | None:
         own = now.step(rest, name)
         forms = curve_forms(now.mixed.system.sizes)
         mine = [form for form in forms if now.shares[name].get(form.channel, 0.0) >= JUDGE.own_share]
-        for form, curve, chi2 in curves_beside(now, rest, mine):
-            ahead = chi2 - 2 * (curve.k - 1) - own * max(now.mixed.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, JUDGE.unlike_left * own) and is_accepted(now, form, rest):
-                best, most = described(now, form, curve, [name]), ahead
+        for curve in curves_with(now, rest, mine):
+            ahead = curve.healthy_chi2 - 2 * (curve.k - 1) - own * max(now.mixed.inflation.get(name, 1.0), 1.0)
+            if ahead > max(most, JUDGE.unlike_left * own) and is_accepted(now, curve.form, rest):
+                best, most = described(now, curve, [name]), ahead
     return best
 
 
 def curve_over_split(now: Search, split: Split) -> Unknown | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it explains most."""
     forms = [f for f in curve_forms(now.mixed.system.sizes) if f.quantity == split.quantity and not f.straight]
-    found = [described(now, form, curve, [split.cause]) for form, curve, _ in curves_beside(now, [], forms)]
-    return max(found, key=lambda curve: curve.score, default=None)
+    found = max(curves_with(now, [], forms), key=lambda curve: curve.score, default=None)
+    return None if found is None else described(now, found, [split.cause])
 
 
 def ride_to_ride(now: Search, worst: Split, constancy: Sequence[Split]) -> Unknown:
@@ -538,9 +529,9 @@ def ride_to_ride(now: Search, worst: Split, constancy: Sequence[Split]) -> Unkno
     return Unknown(channel, RIDE_TO_RIDE, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
 
 
-def described(now: Search, form: CurveForm, curve: CurveFit, denies: Sequence[str]) -> Unknown:
+def described(now: Search, curve: CurveFit, denies: Sequence[str]) -> Unknown:
     """The curve for the report."""
-    score = one_degree(healthy_chi2(now.mixed, form, curve), curve.k, now.mixed.freedom)
+    form = curve.form
     sd = np.sqrt(np.abs(np.diag(curve.covariance)))
     rows = tuple(zip(form.knots, curve.values.tolist(), sd.tolist(), strict=True))
     more, drawn = 0.0, sum(line.ride.energy for line in now.lines)
@@ -550,16 +541,17 @@ def described(now: Search, form: CurveForm, curve: CurveFit, denies: Sequence[st
             values = knots @ curve.values / line.tables[form.channel].unit
             more += float(channel_energy(line, form.channel, values))
     share, unit = more / drawn if drawn else 0.0, KNOTS[form.quantity][1]
-    return Unknown(form.channel, form.quantity, form.straight, unit, score, curve.chi2, rows, tuple(denies), share)
+    shape = (form.channel, form.quantity, form.straight, unit)
+    return Unknown(*shape, curve.score, curve.chi2, rows, tuple(denies), share)
 
 
-def contradicts_causes(now: Search, form: CurveForm, curve: CurveFit, chi2: float) -> bool:
-    """Whether a curve beside the causes is more than the bend of their effect in a channel that names them."""
-    size, share = channel_effect(now, form.channel)
+def contradicts_causes(now: Search, curve: CurveFit) -> bool:
+    """Whether a curve is more than the bend of the causes' effect in a channel that names them."""
+    size, share = channel_effect(now, curve.form.channel)
     if share <= JUDGE.own_share or size <= 0:
         return False
     value, sd = curve.contrasts()
-    certain = np.abs(value) > JUDGE.clear * sd * (curve.chi2 / max(chi2, 1e-12)) ** 0.5
+    certain = np.abs(value) > JUDGE.clear * sd * (curve.chi2 / curve.healthy_chi2) ** 0.5
     return bool(np.any(np.abs(value)[certain & (curve.weights > JUDGE.weighty)] > JUDGE.unlike * size))
 
 
@@ -583,11 +575,11 @@ def channel_effect(now: Search, channel: str) -> tuple[float, float]:
 
 
 def strain_of(now: Search, chosen: Sequence[str], scores: Mapping[str, float]) -> Strain | None:
-    """Implausible explanations beside the causes `chosen`, with `scores` of each candidate; None if there are none.
+    """Implausible explanations next to the causes `chosen`, with `scores` of each candidate; None if there are none.
 
     Two things explain rides away without a cause: a candidate whose evidence asks for a value that it cannot have is
-    not named, and parameters without a cause move in each fit, none of many perhaps beyond its prior, and yet together
-    they may take most of the energy. Then the vehicle, its file or a signal is wrong.
+    not named, and parameters without a cause move in each fit, perhaps each within its prior, and yet together they
+    may take most of the energy. Then the vehicle, its file or a signal is wrong.
     """
     mixed = now.mixed
     impossible = []
@@ -813,7 +805,7 @@ def judge(
         metric = "voltage" if unknown.channel == "cell_voltage" else "power"
         without, with_it = plain.errors.get(metric), gain.errors.get(metric)
         if without is not None and with_it is not None and without.after <= with_it.after:
-            notes.append(f"{unknown} beside the causes is no better known on rides held out: left alone")
+            notes.append(f"{unknown} does not improve rides held out: left out")
             unknown, gain = None, plain
     strain = strain_of(now, chosen, scores)
     what, missed = remaining_error(gain, now.lines)
@@ -853,7 +845,7 @@ def advice(
     if strain is not None:
         guessed = ", ".join(row.parameter for row in strain.refitted if not row.stated)
         lines.append(
-            (f"Give what the file does not say ({guessed}). " if guessed else "")
+            (f"State the parameters that the file leaves open ({guessed}). " if guessed else "")
             + "Vehicle, vehicle file or a signal: these rides cannot tell which is wrong. A wrong unit, sign or scale "
             "is found by `gz-onboard vehicle check`."
         )
@@ -951,6 +943,6 @@ def missing_residuals(now: Search) -> list[str]:
     if any("pack_power" in line.tables for line in now.lines):
         sentences.append(
             "instead, the pack's power (voltage times current) is compared with drive and auxiliaries, as measured or "
-            "by their models: causes that act alike in it are told apart by speed, acceleration and grade alone"
+            "by their models: causes that act alike in it differ by speed, acceleration and grade alone"
         )
     return sentences

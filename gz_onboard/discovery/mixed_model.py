@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from gz_onboard.arrays import Array, Mask
@@ -46,7 +47,7 @@ Noise = Mapping[str, ChannelNoise]  # by channel
 
 @dataclass(frozen=True)
 class MixedConfig:
-    """How rides are linearised, and what is learned of noise and scatter."""
+    """How rides are linearised, and how noise and scatter are learned."""
 
     least_blocks: int = 10  # of a channel in a ride
     outlying: float = 5.0  # standard deviations of a block that is trimmed
@@ -88,7 +89,7 @@ class LinearChannel:
 
     @property
     def unit(self) -> Array:
-        """What y is to be multiplied with to be in the channel's unit, (m,)."""
+        """The factor from y to the channel's unit, (m,)."""
         return self.factor * self.roughness[self.used]
 
     def over(self, values: Array) -> Array:
@@ -208,19 +209,54 @@ class Statistics:
         return float(self.score[list(index)] @ self.estimate(index)) if len(index) else 0.0
 
 
+def one_degree(chi2: float, k: int, freedom: float) -> float:
+    """The square of Student's t that is as unlikely as `chi2` of `k` coefficients.
+
+    Their common scatter is known with `freedom` degrees of freedom, so that this is a quantile of F.
+    """
+    if chi2 <= 0:
+        return 0.0
+    near = chi2
+    while (log_p := float(fisher.logsf(near / k, k, freedom))) < -500:
+        near /= 2  # as far out as this both grow in proportion
+    return float(student.isf(np.exp(log_p) / 2, freedom)) ** 2 * chi2 / near
+
+
 @dataclass(frozen=True)
 class LinearRide:
-    """A ride, linearised, with its sufficient statistics."""
+    """A ride, linearised, with its sufficient statistics. whole: its channels before outliers were trimmed."""
 
     ride: Ride
     tables: Tables
     statistics: Statistics
+    whole: Tables = field(default_factory=dict)
 
     def seen_from(self, offset: Array) -> LinearRide:
         """The same, with residuals as they would be at parameters `offset` (p,) before these, were the model linear."""
         tables = {name: replace(table, y=table.y + table.a @ offset) for name, table in self.tables.items()}
         n = self.statistics.information
         return LinearRide(self.ride, tables, Statistics(n, self.statistics.score + n @ offset))
+
+    def weighed(self, mixed: MixedModel) -> LinearRide:
+        """Without outliers by another model at the same values; with a baseline, more noise where the ride has more."""
+        tables = self.whole
+        wide = np.sqrt(np.diag(mixed.prior)) + 3 * np.sqrt(mixed.scatter)
+        for parameter in [parameter for cause in mixed.usable_causes for parameter in cause.parameters]:
+            (i,) = mixed.index([parameter.name])
+            wide[i] += max(10 * float(np.sqrt(mixed.scatter[i])), 3 * parameter.prior_sd / float(mixed.scale[i]))
+
+        def likeliest(tables: Tables) -> Array:
+            shown = Statistics.of(tables, mixed.noise)
+            rest = shown.score - shown.information @ mixed.mean
+            return np.asarray(mixed.mean + np.linalg.solve(np.diag(1 / wide**2) + shown.information, rest))
+
+        for _ in range(3):  # least trimmed squares (Rousseeuw & Leroy 1987): fit, trim, fit again
+            own = likeliest(tables)
+            tables = {name: _trimmed(table, mixed.noise[name], own) for name, table in self.whole.items()}
+        if mixed.healthy:
+            own = likeliest(tables)
+            tables = {name: _spread_out(table, mixed.noise[name], own) for name, table in tables.items()}
+        return replace(self, tables=tables, statistics=Statistics.of(tables, mixed.noise))
 
     def at_noise(self, noise: Noise) -> LinearRide:
         """The same at another noise."""
@@ -306,14 +342,16 @@ class MixedModel(Population):
     """The frame of the linear model: names (p,), scale (p,), values where it is linearised, and prior knowledge as
     differences from `values`.
 
-    healthy: rides that it was learned on. free (p,): whose scatter between rides is learned. inflation: of a cause's
-    score on healthy rides left out, 1 if right. shapes: what these leave over quantities. checked: in words, how well
-    the energy of healthy rides held out is predicted.
+    causes: candidates; lacking: those whose effect is not in the vehicle's model. healthy: rides that it was learned
+    on. free (p,): whose scatter between rides is learned. inflation: of a cause's score on healthy rides left out, 1 if
+    right. shapes: their curves over quantities. checked: in words, how well the energy of healthy rides held out is
+    predicted.
     """
 
     vehicle: Vehicle
     system: System
     causes: tuple[Candidate, ...]
+    lacking: tuple[Candidate, ...]
     names: tuple[str, ...]
     scale: Array
     values: dict[str, float]
@@ -338,11 +376,6 @@ class MixedModel(Population):
     def usable_causes(self) -> list[Candidate]:
         """The candidates whose parameters some channel depends on."""
         return [cause for cause in self.causes if set(cause.names) <= set(self.names)]
-
-    @property
-    def lacking(self) -> list[Candidate]:
-        """The candidates whose effect is not in the vehicle's model."""
-        return lacking(self.vehicle, self.causes)
 
     def healthy_value(self, name: str) -> float:
         """A parameter's value in the vehicle file; 0 for an effect that is not in its model."""
@@ -393,16 +426,11 @@ class MixedModel(Population):
         return ride
 
 
-def lacking(vehicle: Vehicle, causes: Sequence[Candidate]) -> list[Candidate]:
-    """Those of `causes` whose effect is not in the model of `vehicle`."""
-    has = {effect.name for effect in vehicle.model.effects}
-    return [cause for cause in causes if cause.effect and cause.effect.name not in has]
-
-
 def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
-    """What is known of `vehicle` from its file alone. folder: with effects of the user's own."""
+    """The model of `vehicle` by its file alone. folder: with effects of the user."""
     causes = candidates(folder)
-    missing = lacking(vehicle, causes)
+    has = {effect.name for effect in vehicle.model.effects}
+    missing = tuple(cause for cause in causes if cause.effect and cause.effect.name not in has)
     absent = {name for cause in missing for name in cause.names}
     added = [cause.effect for cause in missing if cause.effect]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *added)
@@ -421,6 +449,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         vehicle=vehicle,
         system=System(effects, vehicle.battery, dict(p), cells, vehicle.riding.vibration, sizes),
         causes=causes,
+        lacking=missing,
         names=tuple(names),
         scale=np.array([prior.scale for prior in priors.values()]),
         values=values,
@@ -456,27 +485,9 @@ def linearised_about(rides: Sequence[Ride], mixed: MixedModel, offset: Array, wo
 
 
 def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:
-    """A ride about the values of a model, without outliers; with a baseline, more noise where the ride has more."""
     ride, mixed = job
-    tables: Tables = dict(_columns(ride, mixed))
-    wide = np.sqrt(np.diag(mixed.prior)) + 3 * np.sqrt(mixed.scatter)
-    for parameter in [parameter for cause in mixed.usable_causes for parameter in cause.parameters]:
-        (i,) = mixed.index([parameter.name])
-        wide[i] += max(10 * float(np.sqrt(mixed.scatter[i])), 3 * parameter.prior_sd / float(mixed.scale[i]))
-
-    def likeliest(tables: Tables) -> Array:
-        shown = Statistics.of(tables, mixed.noise)
-        rest = shown.score - shown.information @ mixed.mean
-        return np.asarray(mixed.mean + np.linalg.solve(np.diag(1 / wide**2) + shown.information, rest))
-
-    whole = tables
-    for _ in range(3):  # least trimmed squares (Rousseeuw & Leroy 1987): fit, trim, fit again
-        own = likeliest(tables)
-        tables = {name: _trimmed(table, mixed.noise[name], own) for name, table in whole.items()}
-    if mixed.healthy:
-        own = likeliest(tables)
-        tables = {name: _spread_out(table, mixed.noise[name], own) for name, table in tables.items()}
-    return LinearRide(ride, tables, Statistics.of(tables, mixed.noise))
+    nothing = Statistics(np.zeros((0, 0)), np.zeros(0))
+    return LinearRide(ride, {}, nothing, dict(_columns(ride, mixed))).weighed(mixed)
 
 
 def _columns(ride: Ride, mixed: MixedModel) -> Iterable[tuple[str, LinearChannel]]:
@@ -521,7 +532,7 @@ def _trimmed(table: LinearChannel, noise: ChannelNoise, own: Array) -> LinearCha
 
 
 def _spread_out(table: LinearChannel, noise: ChannelNoise, own: Array) -> LinearChannel:
-    """`table` with its noise raised to what this ride shows: one that no parameters explain counts for less."""
+    """`table` with its noise raised to that of this ride: one that no parameters explain counts for less."""
     rest = whitened(table, noise, table.y - table.a @ own)
     factor = max(1.0, float(np.sqrt(np.mean(rest**2))))
     return replace(table, y=table.y / factor, a=table.a / factor, factor=factor)
@@ -575,20 +586,19 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> dic
 # --- without a baseline ---------------------------------------------------------------------------------------------
 
 
-def without_baseline(mixed: MixedModel, rides: Sequence[Ride], workers: int = 1) -> MixedModel:
-    """`mixed` of a vehicle file alone, to judge `rides` with.
+def without_baseline(mixed: MixedModel, lines: Sequence[LinearRide]) -> MixedModel:
+    """`mixed` of a vehicle file alone, to judge the rides `lines` with.
 
     An effect that its model does not have is taken to be absent. Noise and scatter are those of the very rides, with
     every possible cause free, so that no cause makes them look noisier than they are.
     """
-    lines = linearise_all(rides, mixed, workers)
     wide = mixed.widened()
     for _ in range(2):  # parameters and noise in turn
         post = wide.fit(lines)
         wide = replace(wide, noise=learn_noise(lines, post.mean + post.own, wide.noise))
         lines = [line.at_noise(wide.noise) for line in lines]
     scatter = mixed.scatter
-    if len(rides) > 2:
+    if len(lines) > 2:
         scatter = wide.learned_scatter(lines, 1.0, 60).scatter
     noise = dict(wide.noise)
     if "cell_voltage_error" in mixed.vehicle.parameters:  # the circuit errs as the file says, and slowly

@@ -2,8 +2,8 @@
 
 Three kinds. *Vehicle*: parameters of the vehicle file, as sure as their calibration says. *Nuisance*: what no vehicle
 file has and no cause is named after, such as the bias of the accelerometer; each with a mean over the vehicle's life
-and a scatter between rides. *Candidate*: what a cause would change. The scatter between rides is the discrepancy of
-Brynjarsdóttir & O'Hagan 2014, as a random effect.
+and a scatter between rides. *Candidate*: parameters that a cause would change. The scatter between rides is the
+discrepancy of Brynjarsdóttir & O'Hagan 2014, as a random effect.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Nuisance:
 
 
 NUISANCES = (  # name, unit, value, sd of the mean, sd between rides, meaning
-    Nuisance("payload_error", "kg", 0.0, 0.0, 2.0, "clothes and luggage beside the mass entered"),
+    Nuisance("payload_error", "kg", 0.0, 0.0, 2.0, "clothes and luggage on top of the mass entered"),
     Nuisance("accel_bias", "m/s²", 0.0, 0.05, 0.02, "bias of the forward accelerometer, or its mounting angle"),
     Nuisance("pitch_gain", "1", 0.0, 0.1, 0.02, "pitch of the body under acceleration, and the accelerometer's gain"),
     Nuisance("altitude_start", "m", 0.0, 0.0, 20.0, "error of the first GPS altitude"),
@@ -51,14 +51,14 @@ NUISANCES = (  # name, unit, value, sd of the mean, sd between rides, meaning
     Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency", per="spin"),
     Nuisance("inverter_current_gain", "1", 1.0, 0.007, 0.002, "gain of the inverter's current measurement"),
     Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset", "current"),
-    Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors", "current"),
+    Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn past inverter and auxiliary current sensors", "current"),
     Nuisance("pack_inverter_lag", "s", 0.0, 0.1, 0.02, "pack current later than the inverter's, beyond 0.1 s"),
     Nuisance("torque_lag", "s", 0.0, 0.1, 0.02, "DC current later than the motor's"),
-    Nuisance("loss_speed", "W/(50 rad/s)", 0.0, 15.0, 1.0, "loss that grows with speed, beside the model's", "power"),
+    Nuisance("loss_speed", "W/(50 rad/s)", 0.0, 15.0, 1.0, "further loss that grows with speed", "power"),
     Nuisance("loss_cross", "W/(2500 A·rad/s)", 0.0, 60.0, 2.0, "loss that grows with current times speed", "power"),
     Nuisance("brake_light", "W", 0.0, 6.0, 0.3, "more auxiliary power while the brake is touched", "auxiliary"),
     Nuisance("inverter_voltage_offset", "V", 0.0, 0.1, 0.01, "offset of the inverter's voltage measurement", "voltage"),
-    Nuisance("soc_start", "1", 0.0, 0.0, 0.04, "state of charge at the start, beyond what the first voltage says"),
+    Nuisance("soc_start", "1", 0.0, 0.0, 0.04, "state of charge at the start, against that by the first voltage"),
     Nuisance("v1_start", "V", 0.0, 0.0, 0.01, "relaxation left over from before the ride"),
     Nuisance("ocv_offset", "V", 0.0, 0.006, 0.004, "rest voltage against the table: hysteresis, relaxation"),
     Nuisance("ocv_tilt", "V", 0.0, 0.03, 0.005, "slope of the rest voltage over SOC against the table"),
@@ -111,7 +111,7 @@ EACH_RIDES_OWN = (*START, "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
 
 @dataclass(frozen=True)
 class VehicleParameter:
-    """A parameter of the vehicle that a channel depends on, beside those of effects.
+    """A parameter of the vehicle, not of an effect, that a channel depends on.
 
     ride_sd: scatter between rides [unit]. healthy_sd: spread of healthy vehicles where the file does not state it.
     size: of `Sizes`, that the scatter grows with if the prior is 0. bench: found on a bench at steady points.
@@ -183,7 +183,7 @@ def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], val
         stated = name in known and not known.known[name].source.startswith("prior:")
         healthy = parameter.healthy_sd if own is None or own.healthy_sd is None else own.healthy_sd
         spread = known.sd(name) if name in known and not absent else parameter.prior_sd
-        if healthy is not None and (absent or not stated or name == "payload_mass"):  # what was entered is known
+        if healthy is not None and (absent or not stated or name == "payload_mass"):  # the mass entered is known
             spread = healthy
         ride_sd = parameter.ride_sd if own is None else own.ride_sd
         # a scatter grows with a parameter over its prior, which is known to a factor of two

@@ -47,9 +47,7 @@ COVARIATES: dict[str, tuple[str, str]] = {
     "pack_current": ("pack current", "A"),
     "motor_current": ("motor current", "A"),
     "time": ("time since the start", "s"),
-    "since_change": ("time since the current changed", "s"),
     "since_braking": ("time since a brake was touched", "s"),
-    "suspension_speed": ("speed of the suspension", "m/s"),
     "vibration": ("vibration: how rough the road is", "m/s²"),
 }
 """Quantities that residuals are shown over: words and unit."""
@@ -152,7 +150,8 @@ def summary(found: Discovery, written: Sequence[str] = ()) -> str:
     lines = [
         f"rides        {rides}, {distance} in {time}{f', {energy} drawn' if energy else ''}; against {known}",
         f"verdict      {report.verdict}: {VERDICTS[report.verdict]}",
-        *_named(report),
+        *_cause_lines(report),
+        *(f"  {kind + ':':20} {text}" for kind, text in _findings(report)),
         f"scores       {', '.join(best)}; healthy rides stay below {report.threshold:.1f}",
         f"residuals    {'; '.join(sizes)}",
         *_gain_lines(report),
@@ -182,31 +181,33 @@ def _extent(found: Discovery) -> tuple[str, str, str, str]:
     return count, f"{distance / 1e3:.1f} km", time, f"{energy / 3.6e6:.2f} kWh" if energy > 0 else ""
 
 
-def _varying(report: Report, cause: FoundCause) -> str:
-    """In words, that a cause differs from ride to ride, and by how much where that is known."""
-    ratios = [split.ratio for split in report.constancy if split.cause == cause.name and split.of_ride]
-    span = f" ({min(ratios):+.2f} to {max(ratios):+.2f} of its mean)" if ratios else ""
-    return f"differs from ride to ride{span}: no model is extended with it"
+def _findings(report: Report) -> list[tuple[str, str]]:
+    """(kind, sentence) on causes that vary, sets that cannot be told apart, and what no candidate explains."""
+    found = []
+    for cause in (cause for cause in report.causes if cause.varies):
+        ratios = [split.ratio for split in report.constancy if split.cause == cause.name and split.of_ride]
+        span = f" ({min(ratios):+.2f} to {max(ratios):+.2f} of its mean)" if ratios else ""
+        found.append(("varies", f"{cause.name} differs from ride to ride{span}: no model is extended with it"))
+    found += [("ambiguous", ", ".join(group)) for group in report.ambiguous]
+    if u := report.unknown:
+        found.append(("unexplained", f"{u}, {u.share:+.1%} of the energy, score {u.score:.0f}"))
+        if u.denies:
+            found.append(("rejected", f"{', '.join(u.denies)}, which would not act alike everywhere"))
+    return found + [("implausible", text) for text in (report.strain.sentences() if report.strain else ())]
 
 
-def _named(report: Report) -> list[str]:
+def _cause_lines(report: Report) -> list[str]:
     lines = []
     for c in report.causes:
-        change = "" if c.change == c.value else f"; change {with_unit(c.change, c.unit, '+.4g')}"
         for name, p in c.parameters.items():
-            text = f"  {c.name if name == c.parameter else '':20} {name} = {with_unit(p.value, p.unit)} "
-            text += f"(95 %: {p.ci95[0]:.4g} to {p.ci95[1]:.4g}"
+            interval = f"95 %: {p.ci95[0]:.4g} to {p.ci95[1]:.4g}"
+            more = ""
             if name == c.parameter:
-                text += f"{change}), {c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
-            lines.append(text + ("" if name == c.parameter else ")"))
-        if c.varies:
-            lines.append(f"  {'':20} {_varying(report, c)}")
-    lines += [f"  ambiguous:           {', '.join(group)}" for group in report.ambiguous]
-    if u := report.unknown:
-        lines.append(f"  unexplained:         {u}, {u.share:+.1%} of the energy, score {u.score:.0f}")
-        if u.denies:
-            lines.append(f"  rejected:            {', '.join(u.denies)}, which would not act alike everywhere")
-    return lines + [f"  implausible:         {text}" for text in (report.strain.sentences() if report.strain else ())]
+                interval += "" if c.change == c.value else f"; change {with_unit(c.change, c.unit, '+.4g')}"
+                more = f", {c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
+            called = c.name if name == c.parameter else ""
+            lines.append(f"  {called:20} {name} = {with_unit(p.value, p.unit)} ({interval}){more}")
+    return lines
 
 
 def _gain_rows(report: Report) -> list[tuple[str, str, list[float], str]]:
@@ -267,7 +268,7 @@ def body(found: Discovery) -> str:
         parts.append(
             f"<details{is_open}><summary>{title}</summary>{drawn(panels(stages, name), readable(name))}</details>"
         )
-    parts += ["<h2>Candidates by score</h2>", drawn(ranking(report), "ranking"), _gain(report)]
+    parts.append(_gain(report))
     if report.unknown:
         parts += ["<h2>Unexplained residual</h2>", drawn(curve(report.unknown), "unknown")]
     return "\n".join([*parts, *_details(report)])
@@ -310,16 +311,8 @@ def _causes(report: Report) -> str:
             + "<p>Score: chi-squared of one degree of "
             f"freedom that the rides lose without it; healthy rides stay below {report.threshold:.1f}.</p>"
         )
-    lines = [f"The {readable(c.name)} {_varying(report, c)}." for c in report.causes if c.varies]
-    lines += [f"<b>Ambiguous:</b> {', '.join(map(readable, group))}." for group in report.ambiguous]
-    if u := report.unknown:
-        lines.append(f"<b>No candidate explains</b> {u}: {u.share:+.1%} of the energy, score {u.score:.0f}.")
-        if u.denies:
-            lines.append(
-                f"<b>Rejected:</b> {', '.join(map(readable, u.denies))}, which would not act alike everywhere."
-            )
-    lines += [f"<b>Implausible:</b> {html.escape(x)}." for x in (report.strain.sentences() if report.strain else ())]
-    return text + "".join(f"<p>{line}</p>" for line in lines)
+    lines = (f"<p><b>{kind.capitalize()}:</b> {html.escape(said)}.</p>" for kind, said in _findings(report))
+    return text + "".join(lines)
 
 
 def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[LinearRide]) -> str:
@@ -386,15 +379,15 @@ def _details(report: Report) -> list[str]:
             "half of a quantity, or of a ride and the others, over the mean: 0 for the cause itself, ±1 for one that "
             "acts in one half only.</p>" + html_table(["cause", "over", "ratio", "chi-squared", "judged"], rows, (2, 3))
         )
-    rows = []
+    rows, scores = [], {row.name: row.score for row in report.ranking}
     for name, x in report.limits.items():
         share = f"{x.energy_share:.1%}" if x.energy_share is not None and x.energy_share > 1e-5 else "–"
         change = "not by these rides" if x.change is None else with_unit(x.change, x.unit, ".3g")
-        rows.append([readable(name), x.parameter, change, share])
-    table = html_table(["cause", "parameter", "change", "of the energy"], rows, (2, 3))
+        rows.append([readable(name), f"{scores[name]:.1f}" if name in scores else "–", x.parameter, change, share])
+    table = html_table(["cause", "score", "parameter", "least change", "of the energy"], rows, (1, 3, 4))
     parts.append(
-        "<h2>Detection limits</h2><p>The least change that would be found half the time, were it alone.</p>"
-        f"<details><summary>Every candidate</summary>{table}</details>"
+        "<h2>Candidates</h2><p>Score in addition to the causes named, of which healthy rides stay below "
+        f"{report.threshold:.1f}, and the least change that would be found half the time, were it alone.</p>{table}"
     )
     if look := report.isolability.look_alikes:
         rows = [[readable(a), readable(b), f"{c:+.2f}"] for a, b, c in look[:20]]
@@ -464,27 +457,6 @@ def panels(stages: Stages, channel: str) -> Figure:
         legend(axes[min(columns, len(axes)) - 1])
         text = f"measured minus model [{CHANNEL[channel].unit}]"
         figure.text(0.012, 0.5, text, rotation=90, va="center", fontsize=8.5, color=INK)
-    return figure
-
-
-def ranking(report: Report) -> Figure:
-    """The score of every candidate, with the threshold."""
-    rows = report.ranking[::-1]
-    height = 0.9 + 0.21 * len(rows)
-    figure = new_figure(9, height)
-    axis = figure.add_axes((0.2, 0.55 / height, 0.76, 1 - 0.75 / height))
-    rule(axis)
-    near = {name: "#8fb8de" for group in report.ambiguous for name in group}
-    colours = near | {cause.name: BLUE for cause in report.causes}
-    bars = [colours.get(row.name, "#cbd2d9") for row in rows]
-    axis.barh([readable(row.name) for row in rows], [max(row.score, 0.0) for row in rows], color=bars, height=0.7)
-    axis.axvline(report.threshold, color=INK, linewidth=1, linestyle=(0, (4, 2)), label="threshold")
-    axis.set_xscale("symlog", linthresh=10)
-    axis.set_xlim(0, max(2 * report.threshold, 1.3 * max((row.score for row in rows), default=1)))
-    axis.set_xlabel("score beside the causes named (blue), linear up to 10", fontsize=8.5, color=INK)
-    axis.tick_params(axis="y", colors=INK)
-    axis.margins(y=0.01)
-    legend(axis)
     return figure
 
 

@@ -40,12 +40,13 @@ from gz_onboard.priors import USUAL_SIZES, Sizes
 
 Values = Mapping[str, float]
 """Parameters and nuisances by name."""
-DT = COARSE * STEP  # s: step of the battery and cooling models
+DT = COARSE * STEP  # s: step of the model of the cells
+WARMING = 10  # grid steps to one of the cooling networks: 1 s, as in the simulation
 
 
 @dataclass(frozen=True)
 class NuisanceScales:
-    """What the nuisance parameters are per, so that all are of order one.
+    """The units of the nuisance parameters, chosen so that all are of order one.
 
     Those of current, force and motor speed are of a vehicle of size 1 and grow with `Sizes`.
     """
@@ -58,7 +59,7 @@ class NuisanceScales:
     saturation: float = 100.0  # A of the motor: half of its limit
     slip: float = 100.0  # N at the wheel: a steep hill
     drift: float = 600.0  # s: a short ride
-    empty: float = 0.4  # of SOC below full: what a usual ride takes
+    empty: float = 0.4  # of SOC below full: a usual ride
     cell_current: float = 5.0  # A, some 2 C
     middle: float = 0.7  # SOC about which the rest voltage tilts: of most rides
     wind: float = 10.0  # m/s of air past the vehicle
@@ -359,56 +360,55 @@ def front_speed(ride: Ride, p: Values, system: System) -> Array:
 
 
 def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
-    """Losses [W] at steps of `DT`: (motor, the part of it without current, inverter)."""
+    """Losses [W] at steps of 1 s: (motor, the part of it without current, inverter)."""
     q = moving(ride, p, system)
     electric, drag = motor_losses(ride, q, p, system)
-    inverter = system.sum(q, p, STEP, Port.INVERTER_LOSS)
-    n = len(ride.time)
-    motor, idle, inverter = (block_means(np.broadcast_to(x, n), COARSE) for x in (electric + drag, drag, inverter))
+    losses = (electric + drag, drag, system.sum(q, p, STEP, Port.INVERTER_LOSS))
+    motor, idle, inverter = (block_means(np.broadcast_to(x, len(ride.time)), WARMING) for x in losses)
     return motor, idle, inverter
 
 
-def _warmed(
-    ride: Ride, p: Values, channel: tuple[str, str], network: Network, watts: Array, idle: Sequence[Array] = ()
-) -> Array:
+def _warmed(ride: Ride, p: Values, channel: tuple[str, str], network: Network, watts: Array, *idle: Array) -> Array:
     """Measured temperature minus that of `network` [K], heated by `watts`, of which `idle` without current.
 
     channel: (sensor, parameter of how much more moving air cools than the network says).
     """
     sensor, airflow = channel
-    speed, ambient = np.abs(ride.coarse["speed"]), ride.coarse["ambient_temperature"]
+    speed, ambient = (block_means(ride.quantities[name], WARMING) for name in ("speed", "ambient_temperature"))
+    speed = np.abs(speed)
     factor = p.get("cooling_factor", 1.0) * np.maximum(1 + p[airflow] * speed / PER.wind, 0.05)
-    modelled: Array = np.array(temperatures(network, DT, watts, ambient, speed, factor, *idle))
-    return ride.coarse[sensor] - modelled
+    modelled: Array = np.array(temperatures(network, WARMING * STEP, watts, ambient, speed, factor, *idle))
+    return block_means(ride.signals[sensor], WARMING) - modelled
 
 
 def _first(ride: Ride, sensor: str) -> float:
-    return float(ride.coarse[sensor][:20].mean())
+    """The mean of the first 10 s."""
+    return float(ride.signals[sensor][:100].mean())
 
 
 def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """Stator temperature [K] minus that of the cooling network at the modelled loss, at steps of `DT`."""
+    """Stator temperature [K] minus that of the cooling network at the modelled loss, at steps of 1 s."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
-    ambient = float(ride.coarse["ambient_temperature"][0])
+    ambient = float(ride.quantities["ambient_temperature"][:WARMING].mean())
     network = MotorCooling(p, stator, stator + p["rotor_start"] * (stator - ambient) / PER.warmer)
-    watts, *idle, _ = _heat(ride, p, system)
+    watts, idle, _ = _heat(ride, p, system)
     return _warmed(ride, p, ("motor_temperature", "motor_airflow"), network, watts, idle)
 
 
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """Board temperature [K] minus that of the cooling network at the modelled loss, at steps of `DT`."""
+    """Board temperature [K] minus that of the cooling network at the modelled loss, at steps of 1 s."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
     network = InverterCooling(p, board, board + p["box_start"])
     return _warmed(ride, p, ("inverter_temperature", "inverter_airflow"), network, _heat(ride, p, system)[2])
 
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """Cell temperature [K] minus that of a lump heated by the circuit, at steps of `DT`."""
+    """Cell temperature [K] minus that of a lump heated by the circuit, at steps of 1 s."""
     cell = cell_circuit(ride, p, system)
     watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
     watts = watts + reversible_heat_over(system.pack, cell.current, cell.soc, ride.coarse["cell_temperature"])
     network = LumpedCooling(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
-    return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, watts)
+    return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, block_means(watts, WARMING // COARSE))
 
 
 AS_IN_FILE = (

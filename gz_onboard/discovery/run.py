@@ -1,4 +1,4 @@
-"""Discovery: what a set of rides shows beyond what is known of the vehicle."""
+"""A discovery: rides in, report out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gz_onboard.discovery.baseline import restore
 from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.grid import STEP, Ride
 from gz_onboard.discovery.judgement import Discovery, judge
-from gz_onboard.discovery.mixed_model import MixedModel, linearised_about, without_baseline
+from gz_onboard.discovery.mixed_model import MixedModel, linearise_all, linearised_about, without_baseline
 from gz_onboard.discovery.residuals import voltage_timing
 from gz_onboard.discovery.search import search_causes, search_problem
 from gz_onboard.errors import InputError, nearest
@@ -53,8 +53,13 @@ def discover(
             "no healthy rides are known of this vehicle (--baseline): it is compared with its file, whose model is "
             "taken at its word, and the rate of false alarms is not calibrated"
         )
-        mixed = without_baseline(mixed, found, workers)
-    problem = search_problem(mixed, found, first_offset(mixed, found), workers)
+        lines = linearise_all(found, mixed, workers)
+        mixed = without_baseline(mixed, lines)
+        lines = [line.weighed(mixed) for line in lines]
+    offset = first_offset(mixed, found)
+    if mixed.healthy or np.any(offset):
+        lines = linearised_about(found, mixed, offset, workers)
+    problem = search_problem(mixed, lines, offset, workers)
     progress(f"{len(problem.causes)} candidates")
     now = search_causes(problem)
     held = linearised_about(apart, now.mixed, now.offset, workers) if apart else []

@@ -1,10 +1,10 @@
 """The search for causes: forward selection with exchange, and tests on rides held out and between rides.
 
 All questions about a set of causes are asked of one pair of matrices, so that trying a set costs microseconds. Large
-changes are not linear: causes are searched about what they change, until it no longer moves.
+changes are not linear: the search is repeated about the changes found, until they settle.
 
 A cause is accepted within its bounds, beyond the scatter of these rides, and if it predicts rides held out: the scatter
-of healthy rides is not that of the healthy world, and what they did not vary the next rides show for the first time.
+of a few healthy rides is not that of all, and the next rides may vary a quantity for the first time.
 """
 
 from __future__ import annotations
@@ -14,13 +14,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from gz_onboard.arrays import Array
 from gz_onboard.discovery.curves import CurveForm, bordered, columns_of, curve_forms, extended
-from gz_onboard.discovery.grid import Ride
-from gz_onboard.discovery.mixed_model import LinearChannel, LinearRide, MixedModel, Statistics, linearised_about
+from gz_onboard.discovery.mixed_model import (
+    LinearChannel,
+    LinearRide,
+    MixedModel,
+    Statistics,
+    linearised_about,
+    one_degree,
+)
 from gz_onboard.discovery.parameters import EACH_RIDES_OWN, LOG_SCALED, Candidate
 from gz_onboard.model.effect import MOVING
 
@@ -53,7 +58,7 @@ class SearchConfig:
 
 SEARCH = SearchConfig()
 RIDE_PREFIX = "ride "  # before a ride's name, where a split is that ride against the others
-IMPOSSIBLE = "would be beyond what it can be"
+IMPOSSIBLE = "would be beyond its bounds"
 
 
 @dataclass(frozen=True)
@@ -159,7 +164,7 @@ class Search:
         return self.step([other for other in chosen if other != name], name)
 
     def least(self, base: Sequence[str], name: str) -> float:
-        """The score that `name` must have beside `base`: more than what mends the form of a large effect."""
+        """The score that `name` must have on top of `base`: more than a correction of the form of a large effect."""
         mine = self.shares.get(name, {})
         bend = 0.0
         for other in base:
@@ -202,7 +207,7 @@ class Search:
         return replace(self, lines=lines, offset=offset)
 
     def selected(self) -> Search:
-        """The search with the causes that explain the rides, linearised about what they change."""
+        """The search with the causes that explain the rides, linearised about their changes."""
         now = replace(self, chosen=self.choose())
         for _ in range(SEARCH.rounds):
             if not now.chosen:
@@ -227,22 +232,8 @@ class Search:
         return (float(np.clip(value + x * scale, low, bounds.high)) - value) / scale
 
 
-def one_degree(chi2: float, k: int, freedom: float) -> float:
-    """The square of Student's t that is as unlikely as `chi2` of `k` coefficients.
-
-    Their common scatter is known with `freedom` degrees of freedom, so that this is a quantile of F.
-    """
-    if chi2 <= 0:
-        return 0.0
-    near = chi2
-    while (log_p := float(fisher.logsf(near / k, k, freedom))) < -500:
-        near /= 2  # as far out as this both grow in proportion
-    return float(student.isf(np.exp(log_p) / 2, freedom)) ** 2 * chi2 / near
-
-
-def search_problem(mixed: MixedModel, rides: Sequence[Ride], start: Array, workers: int = 1) -> Search:
-    """The search for the candidates of `mixed`, in rides linearised first at `start` (p,), in scales."""
-    lines = linearised_about(rides, mixed, start, workers)
+def search_problem(mixed: MixedModel, lines: Sequence[LinearRide], start: Array, workers: int = 1) -> Search:
+    """The search for the candidates of `mixed` in rides linearised at `start` (p,), in scales."""
     evidence = mixed.evidence(lines)
     visible = np.diag(evidence.information) >= SEARCH.visible
     causes = {c.name: c for c in mixed.usable_causes if np.all(visible[mixed.index(c.names)])}
@@ -359,7 +350,7 @@ def improves(held: Iterable[tuple[Model, Model, Model]], shares: Mapping[str, fl
 
 
 def held_out_with(now: Search, name: str) -> Iterator[tuple[Model, Model, Model]]:
-    """Rides held out with `name` beside the other causes chosen; the control is without it."""
+    """Rides held out with `name` among the causes chosen; the control is without it."""
     causes = [now.causes[n] for n in now.chosen]
     return held_out(now.mixed, now.lines, causes, [c for c in causes if c.name != name])
 
@@ -422,7 +413,7 @@ def _in_ride(mine: LinearRide) -> Sign:
 def splits(now: Search) -> list[Split]:
     """Of each cause chosen, whether it acts alike in left and right bends, early and late, slow and fast, in all rides.
 
-    Its columns are split in two, and the difference of the halves is a parameter of its own, the `ratio` to their mean:
+    Its columns are split in two, and the difference of the halves becomes a parameter, the `ratio` to their mean:
     0 for the cause itself, ±1 for what acts in one half only (constancy of a coefficient: Chow 1960; Hansen 1992).
     """
     halves = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
@@ -517,7 +508,7 @@ def accepted(search: Search) -> Search:
 
 
 def search_causes(problem: Search) -> Search:
-    """The causes that are accepted, beside each ride's own wind if the winds are stronger than on healthy rides."""
+    """The causes that are accepted, with the wind of each ride if winds are stronger than on healthy rides."""
     now = accepted(problem)
     wind = next((cause for cause in now.causes.values() if cause.varies), None)
     if wind is None or wind.name in now.chosen:

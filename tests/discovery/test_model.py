@@ -20,17 +20,7 @@ from gz_onboard.discovery.curves import (
     curve_forms,
     supported_knots,
 )
-from gz_onboard.discovery.grid import (
-    GRID,
-    STEP,
-    Ride,
-    grade_by_altitude,
-    since,
-    since_change,
-    steering,
-    suspension_speed,
-    vibration,
-)
+from gz_onboard.discovery.grid import GRID, STEP, Ride, grade_by_altitude, since, steering, vibration
 from gz_onboard.discovery.mixed_model import (
     LinearChannel,
     LinearRide,
@@ -40,12 +30,12 @@ from gz_onboard.discovery.mixed_model import (
     learn_noise,
     linearise_all,
     linearised_about,
+    one_degree,
     whitened,
 )
 from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.parameters import candidates
 from gz_onboard.discovery.residuals import cell_temperature, counted_soc
-from gz_onboard.discovery.search import one_degree
 from gz_onboard.model.effect import load_effect, package_effects
 from gz_onboard.model.model import standing_load
 from gz_onboard.model.series import all_quantities, total
@@ -83,15 +73,6 @@ def test_time_since_an_event_is_a_minute_at_most():
     assert since(happens)[[0, 100, 101, 111, 399, 999]] == pytest.approx([60.0, 0, 0, 1.0, 29.8, 59.9])
 
 
-@given(at=st.integers(20, 400), jump=st.floats(11, 100), before=st.integers(1, 100))
-def test_time_since_the_current_changed(at: int, jump: float, before: int):
-    current = np.zeros(at + before)
-    current[at:] = jump
-    found = since_change(current)
-    assert (found[:at] == 60.0).all() and found[at] == 0.0
-    assert found[-1] == pytest.approx(0.1 * max(0, before - 5))  # the change is seen for half a second
-
-
 def test_steering_is_that_of_a_bicycle():
     speed = np.array([3.0, -5.0, 8.0])
     assert steering(speed, speed**2 / 20.0, 1.3) == pytest.approx(1.3 / 20.0)
@@ -104,13 +85,6 @@ def test_the_grade_by_altitude_is_that_of_the_hill():
     grade = grade_by_altitude(20.0 * np.sin(way / 300.0), speed)
     assert grade[300:-300] == pytest.approx((20.0 / 300.0) * np.cos(way / 300.0)[300:-300], abs=0.003)
     assert not grade_by_altitude(way, np.zeros(4000)).any()
-
-
-def test_suspension_speed_is_the_rms_of_both_wheels():
-    time = np.arange(0, 30, 0.02)
-    wheels = [(time, 0.03 + a * np.sin(2 * np.pi * 1.5 * time)) for a in (0.010, 0.004)]
-    each = [a * 2 * np.pi * 1.5 / np.sqrt(2) for a in (0.010, 0.004)]
-    assert suspension_speed(wheels, np.arange(5, 25, 0.1)) == pytest.approx(np.hypot(*each), rel=0.05)
 
 
 def test_vibration_on_the_grid_is_that_of_the_road_there():
