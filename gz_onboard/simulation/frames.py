@@ -69,7 +69,7 @@ def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dro
 def messages_sent(vehicle: Vehicle) -> list[Message]:
     """The messages of which frames can be simulated.
 
-    InputError if the vehicle's DBC files have none of the sensors' signals, or a message has no period or cannot be
+    InputError if the vehicle's DBC files have no signal of the sensors, or a message has no period or cannot be
     packed.
     """
     known, periods = {sensor.signal for sensor in (*SENSORS, *ROLLER)}, vehicle.mapping.periods

@@ -142,7 +142,7 @@ class Controller:
 # --- driven wheel -----------------------------------------------------------------------------------------------------
 
 RELAXATION_LENGTH_M = 0.12  # of the driven tyre, longitudinal
-BRAKE_PASSES = 4  # of front and rear brake in turn, where both hold; each leaves a twentieth of what they disagree by
+BRAKE_PASSES = 4  # of front and rear brake in turn, where both hold; each leaves a twentieth of their difference
 FREELY_M_S = 0.5  # above it the front brake does all it can, for it stops nothing within a step
 
 

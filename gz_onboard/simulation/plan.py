@@ -102,7 +102,9 @@ def _plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
     if kind == "ride":
         return _ride_plan(path, options, vehicle, roller)
     if options.predictive:
-        raise InputError(f"--predictive: {path} is a {kind}, whose speed is followed anyway; it is for recorded rides")
+        raise InputError(
+            f"--predictive: {path} is a {kind}, and its speed is followed anyway; it is for recorded rides"
+        )
     if kind == "route":
         return _route_plan(path, options, roller)
     cycle = find_cycle(what)

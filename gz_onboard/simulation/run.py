@@ -117,7 +117,7 @@ class Run:
     soc_end: float
     form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
-    beyond: tuple[Beyond, ...] = ()  # what the battery could not give
+    beyond: tuple[Beyond, ...] = ()  # demands that the battery could not meet
     shortfalls: list[Shortfall] = field(default_factory=list)
 
     __repr__ = brief

@@ -105,7 +105,7 @@ class Scooter:
             rough = 0.0 if self.dynamometer else self.vehicle.riding.vibration
         self._vibration_at = rough if callable(rough) else None
         self._rough = 0.0 if callable(rough) else rough
-        self.vibration = 0.0  # m/s², of a vehicle whose effects read it
+        self.vibration = 0.0  # m/s², if effects of the model read it
         model = self.vehicle.model
         outside = [effect.reads for effect in model.effects if effect.port is not Port.CELL_VOLTAGE]
         self._tracks = bool(model.reads & SURROUNDINGS or CELLS & frozenset().union(*outside))

@@ -198,7 +198,7 @@ def shaken(sensor: SimulatedSensor, truth: Truth, period: float) -> Array | None
         return None
     keep = np.exp(
         -period / VIBRATION_PERIOD_S
-    )  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
+    )  # of the slow mean; the faster part has a variance of keep²·(1 + (1-keep)/(1+keep))
     shown: Array = truth["vibration"] / (keep * np.sqrt(2 / (1 + keep)))
     return shown
 

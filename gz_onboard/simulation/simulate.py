@@ -134,7 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
 def ride(
     vehicle: Vehicle, plan: Plan, options: SimulationOptions, progress: Progress | None, trace: Trace | None = None
 ) -> tuple[Run, Scooter]:
-    """Ride `plan` with `options`; what these do not say of the start is as it was recorded."""
+    """Ride `plan` with `options`; where these leave the start open, it is as recorded."""
     recorded, soc = plan.recorded, options.soc
     if soc is None:
         measured = rest_soc(recorded, vehicle) if recorded else None

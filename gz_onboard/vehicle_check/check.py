@@ -180,7 +180,7 @@ def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int])
 
 
 def _dropped(codec: Codec, columns: Columns) -> Iterator[Finding]:
-    """Signals whose values were dropped, outside the limits of the DBC file or of any vehicle."""
+    """Signals with many values dropped, outside the limits of the DBC file or of any vehicle."""
     roles = {f"{source.message}.{source.signal}": source.role for source in codec.mapping.sources}
     for (name, reason), count in sorted(codec.faults.items()):
         role = roles.get(name)
@@ -191,7 +191,7 @@ def _dropped(codec: Codec, columns: Columns) -> Iterator[Finding]:
 
 
 def _unanswered(codec: Codec, columns: Columns) -> Iterator[Finding]:
-    """Requests whose answers have another length than the file says, and those that an ECU refused."""
+    """Requests with answers of an unexpected length, and requests that an ECU refused."""
     roles = {
         request.name: tuple(source.role for source in codec.mapping.sources if source.message == request.name)
         for request in codec.mapping.requests
@@ -228,7 +228,7 @@ def _seen(
 def on_board(log: Path, vehicle: Vehicle, load_fits: bool, of: PackRide | None) -> Iterator[Finding]:
     """Run the daemon's pipeline over the log: sensors that it leaves out, and the error of the voltage.
 
-    load_fits: whether the power needed is the model's. of: what the pack gives.
+    load_fits: whether the power needed is the model's. of: voltage and current of the pack.
     """
     if vehicle.battery is None:
         return

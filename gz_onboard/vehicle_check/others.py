@@ -1,4 +1,4 @@
-"""Temperatures, switches and whatever else a log says, against what the vehicle file calls them."""
+"""Temperatures, switches, throttle and stuck signals of a log."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _swapped(ride: Seconds, moving: Mask) -> Iterator[Finding]:
 
 
 def _switches(ride: Seconds, moving: Mask) -> Iterator[Finding]:
-    """Those whose state is known while moving."""
+    """Switches with a known state while moving."""
     for role, riding, state in (("charge_plug", 0, "plugged in"), ("key", 1, "off"), ("contactor", 1, "open")):
         if role not in ride or not np.isfinite(ride[role][moving]).any():
             continue

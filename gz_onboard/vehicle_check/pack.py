@@ -185,7 +185,7 @@ def _road(ride: Seconds, power: Array, vehicle: Vehicle, speed: Array, payload: 
 
 
 def _braking(of: PackRide, current: Array, speed: Array) -> Finding:
-    """Whether the current has a sign, and what is recovered is in it."""
+    """Whether the current has a sign, and shows the recovered energy."""
     check, roles = "current while braking", (CURRENT,)
     braking = (np.abs(speed) > CONFIG.moving_m_s) & (rate(np.abs(speed)) < SETTINGS.brakes_m_s2) & np.isfinite(current)
     if braking.sum() < FEWEST:
@@ -273,7 +273,7 @@ def _cells(ride: Seconds, of: PackRide, suspects: set[str]) -> list[Finding]:
 
 
 def _within_cells(of: PackRide, voltage: Array, role: str, suspects: set[str]) -> Finding:
-    """A voltage [V] (n,) within what the cells can have."""
+    """A voltage [V] (n,) within the limits of the cells."""
     battery, series = of.battery, of.battery.cells_series
     full, empty = battery.ocv_curve.y[-1], battery.cutoff_voltage
     low, high = SETTINGS.emptiest * min(empty, battery.ocv_curve.y[0]), CONFIG.highest_voltage_ratio * full
@@ -340,7 +340,7 @@ def _series_that_fit(of: PackRide, volts: float, amperes: float, gauge: float, l
     """Another number of cells in series that clearly fits the voltage at the gauge's state of charge.
 
     It is known as closely as the rest voltage: by the table's sd, the slope where the charge is in doubt, the drop, and
-    what is left of the load before.
+    and the remainder of the load before.
     """
     battery = of.battery
     soc, load = battery.window.of_cells(gauge), amperes / battery.cells_parallel

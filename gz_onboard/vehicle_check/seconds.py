@@ -15,7 +15,7 @@ from gz_onboard.recording.recording import Recording
 from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
-SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each
+SECOND = 1.0  # s, spacing of the grid, and span of the mean at each point
 FEWEST = 30  # points that two signals must have together before they say anything of each other
 ALIKE = 0.06  # relative: a ratio that is so near that of two units is theirs
 RARER = 0.02  # relative: so much nearer it must be to a power of ten, or to two units that are both not of SI
@@ -61,7 +61,7 @@ def seconds_of(samples: Recording, vehicle: Vehicle) -> Seconds:
 
 
 def rate(values: Array) -> Array:
-    """Change of `values` (n,) each second; none of a single one, which shows none."""
+    """Return the change of `values` (n,) each second; 0 of a single one."""
     return np.gradient(values, SECOND) if len(values) > 1 else np.zeros_like(values)
 
 
