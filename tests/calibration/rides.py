@@ -60,3 +60,20 @@ def ride(
         "cell_temperature": np.full(len(time), temperature),
     }
     return Recording(f"ride_{seed}", {role: (time, values) for role, values in columns.items() if role not in drop})
+
+
+def gps_ride(
+    radius: float, seed: int, lag: float = 0.4, minutes: float = 10, top: float = 12.0, bias: float = 0.0
+) -> Recording:
+    """Stop and go with cruising between; the receiver reports `lag` [s] late, with noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 60 * minutes, 0.05)
+    target = np.repeat(rng.choice([0.0, 0.6, 0.8, 1.0], size=int(minutes * 2) + 1) * top, 600)[: len(time)]
+    speed = np.empty_like(time)
+    v = 0.0
+    for k, wanted in enumerate(target):
+        v += float(np.clip((wanted - v) / 1.0, -1.5, 1.2)) * 0.05
+        speed[k] = v
+    fixes = np.arange(2.0, time[-1], 0.2)
+    gps = np.interp(fixes - lag, time, speed) * (1 + bias) + rng.normal(0, 0.05, len(fixes))
+    return Recording(f"ride_{seed}", {"motor_speed": (time, speed / radius), "gps_speed": (fixes, gps)})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,14 @@ import numpy as np
 import pytest
 
 from gz_onboard.calibration.coastdown import NAMES, coast, coast_downs, directions, samples
-from gz_onboard.calibration.table import Measurements, read_table
+from gz_onboard.calibration.table import read_table
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
-from gz_onboard.model.effect import load_effect
-from gz_onboard.model.model import Model
 from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
 LOGS = Path(__file__).parents[2] / "replay_logs"
-DATA = os.environ.get("GZ_ONBOARD_DATA")
 DT = 0.1
 
 
@@ -113,15 +109,6 @@ def test_left_out_pairs_are_followed(healthy):
     assert own.points == still.points > 100
 
 
-def test_covariance_is_that_of_the_values(healthy):
-    found = coast_downs(healthy[0], VEHICLE, hold_out=False)
-    ((names, covariance),) = found.covariance
-    assert names == NAMES
-    assert np.allclose(np.sqrt(np.diag(covariance)), [found.parameters[name].sd for name in NAMES])
-    assert (np.linalg.eigvalsh(covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))) > 0).all()
-    assert found.panels[0].title == "Coast-downs"
-
-
 def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
     every = [coast_downs(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
     refused = [found for found in every if found.parameters["rolling_resistance_speed"].value == 0]
@@ -185,20 +172,6 @@ def test_the_recorded_coastdown():
     assert rolled.speed[-1] < 2.5
     assert (rolled.slowing > 0).all()
     assert rolled.temperature == pytest.approx(12.5, abs=0.3)
-
-
-@pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA names no folder of recorded rides")
-def test_commissioning_coastdowns():
-    logs = sorted(Path(DATA or "").rglob("commissioning/coastdown_*.blf"))
-    if not logs:
-        pytest.skip("no coast-downs in GZ_ONBOARD_DATA")
-    found = coast_downs([read_recording(log, VEHICLE) for log in logs], VEHICLE)
-    own, still = (fit for fit in found.fits if fit.held_out)
-    assert own.largest < 0.3
-    assert still.largest < 1.2
-    c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
-    assert abs(c0.value - 0.012) < 3 * c0.sd
-    assert 0.4 < area.value < 0.65
 
 
 # --- CSV ----------------------------------------------------------------------------------------------------------
@@ -284,38 +257,3 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
         # A table begins at its greatest speed, a ride where the throttle closes.
         assert value == pytest.approx(same.parameters[name].value, abs=0.7 * same.parameters[name].sd)
         assert abs(value - truth[name]) < 3 * found["parameters"][name]["sd"]
-
-
-def small_car():
-    """A vehicle without a driven wheel that turns along, of 76 kg in all: wheels of a Shell Eco-marathon car."""
-    small = {
-        "drag_area": 0.064,
-        "rolling_resistance_constant": 0.004,
-        "wheel_inertia_front": 0.02,
-        "wheel_inertia_rear": 0.01,
-    }
-    p = VEHICLE.parameters
-    known = {
-        n: replace(v, value=small.get(n, v.value), sd=0.2 * small[n] if n in small else v.sd)
-        for n, v in p.known.items()
-    }
-    parameters = type(p)(known)
-    effects = tuple(load_effect(n) for n in ("aerodynamic_drag", "rolling_resistance", "grade_force", "inertia"))
-    return replace(VEHICLE, parameters=parameters, model=Model(effects, parameters))
-
-
-@pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA names no folder of recorded rides")
-def test_speeds_alone_give_wide_intervals():
-    """An Eco-marathon car, 1 Hz speeds, no wind, no slope; its builders give a rolling coefficient by own fit."""
-    folder = Path(DATA or "") / "real" / "coastdown_ecomarathon"
-    if not folder.is_dir():
-        pytest.skip("no Eco-marathon coast-downs in GZ_ONBOARD_DATA")
-    runs = []
-    for name in ("A", "A1", "B", "B1"):
-        speed = np.loadtxt(folder / f"Michelin60{name}.csv") / 3.6
-        table = Measurements(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
-        runs.append(samples(table, {"direction": name[0], "total_mass_kg": 76.0, "ambient_C": 30.0}))
-    found = coast_downs(runs, small_car(), hold_out=True)
-    c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
-    assert 0.001 < c0.value < 0.008
-    assert area.sd > 0.1 * area.value

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.calibration.fit import as_groups, correlation, every_second, line, linear, nonlinear, score, split
-from gz_onboard.calibration.result import compared
+from gz_onboard.calibration.fit import correlation, linear, nonlinear, score
 from gz_onboard.errors import InputError
 
 SEEDS = 400
@@ -79,39 +78,7 @@ def test_refusals():
         nonlinear(lambda p: p[:1] - np.ones(4), {"a": 0.0, "k": 1.0})
 
 
-def test_split_holds_out_a_share_and_is_the_same_each_time():
-    keep = split(90)
-    assert keep.sum() == 60 and np.array_equal(keep, split(90)) and not np.array_equal(keep, split(90, seed=1))
-
-
 def test_score():
     fit = score("x", "W", np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0]), held_out=True, source="here")
     assert (fit.largest, fit.r2, fit.points) == (1.0, 0.5, 3) and fit.rms == pytest.approx(np.sqrt(1 / 3))
     assert score("x", "W", np.ones(3), np.ones(3), held_out=True, source="here").r2 is None
-
-
-def test_a_line_of_all_points_and_of_some():
-    x = np.arange(8.0)
-    y = np.where(x < 4, 2 * x + 1, 3 * x)
-    found, whole, part = line("slope", x, y, x < 4)
-    assert found["slope"] == pytest.approx(np.polyfit(x, y, 1)[0])
-    assert whole == pytest.approx(found["slope"] * x + found["offset"])
-    assert part == pytest.approx(2 * x + 1)
-
-
-def test_groups_count_from_three_on_and_every_second_is_fitted():
-    labels = np.array([0, 0, 1, 1, 2])
-    assert as_groups(labels) is labels
-    assert as_groups(labels[:4]) is None
-    assert every_second(labels).tolist() == [True, True, False, False, True]
-    assert every_second(np.zeros(9, dtype=int)).tolist() == split(9).tolist()
-
-
-def test_data_and_model_are_drawn_with_what_is_left_over():
-    x, data, model = np.array([2.0, 1.0]), np.array([5.0, 3.0]), np.array([4.5, 3.5])
-    both, left = compared("Sag", "current [A]", "voltage, mean [V]", x, data, model)
-    assert both.traces[1].x.tolist() == [1.0, 2.0]
-    assert both.traces[1].y.tolist() == [3.5, 4.5]
-    assert (left.title, left.y_label) == ("Sag: residual", "measured less model [V]")
-    assert left.traces[0].y.tolist() == [0.5, -0.5]
-    assert compared("Loss", "x", "y [W]", x, data, model, "x")[0].traces[1].x.tolist() == [2.0, 1.0]

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.calibration.cell import OCV_SOC, open_circuit
-from gz_onboard.calibration.table import read_table
 from gz_onboard.errors import InputError
-from tests.calibration.cells import slow_test
-
-DATA = os.environ.get("GZ_ONBOARD_DATA")
-NEEDS_DATA = pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA is not set")
+from tests.calibration.cells import Plant, slow_test
 
 
 @given(capacity=st.floats(1, 5), r0=st.floats(0.01, 0.08), hysteresis=st.floats(0, 0.01), seed=st.integers(0, 1000))
@@ -82,6 +76,9 @@ def changed(**columns):
     return replace(table, columns={**table.columns, **{k: f(table.columns[k].copy()) for k, f in columns.items()}})
 
 
+PIECES = [(0, 600, 60), (0.125, 43200, 60), (0, 3600, 60), (0.125, 28800, 60), (0, 3600, 60)]
+
+
 def put(index, value):
     def change(column):
         column[index] = value
@@ -98,6 +95,9 @@ def put(index, value):
         (changed(time=lambda t: np.where(t > 30000, t + 9000, t)), "a gap of 9060 s while a current"),
         (changed(voltage=lambda v: np.maximum(v, 3.6)), "it is clipped"),
         (slow_test(hours=3)[0], "the discharge takes 3.0 h"),
+        (changed(voltage=put(500, 0.0)), "ocv.csv:501: voltage is 0 V"),
+        (changed(current=lambda c: np.where(c < 0, 1.25 * c, c)), r"brings back 3.\d+ of 2.500 A·h.*10 %"),
+        (Plant().run(PIECES, name="ocv.csv"), r"ocv.csv: 2.5\d* A·h are drawn in pieces.* 1.5\d* of it without a"),
     ],
 )
 def test_what_is_no_slow_test_is_refused(table, words):
@@ -112,13 +112,3 @@ def test_a_missing_column_and_too_few_samples_are_named():
         open_circuit(replace(table, columns=without))
     with pytest.raises(InputError, match="20 samples are too few"):
         open_circuit(replace(table, columns={k: v[:20] for k, v in table.columns.items()}))
-
-
-@NEEDS_DATA
-def test_the_bench_cell():
-    result = open_circuit(read_table(Path(str(DATA)) / "bench/cell_ocv_25C.csv.gz"))
-    assert abs(result.parameters["cell_capacity"].value - 2.734) < 0.003
-    curve = result.curves["battery.ocv"]
-    assert np.all(np.diff(curve.value) > 0)
-    assert not result.refusals
-    assert np.median(curve.sd) < 0.005

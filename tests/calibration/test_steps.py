@@ -13,8 +13,7 @@ from gz_onboard.calibration.table import Named
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import OWN
 
-from .rides import VEHICLE, ride
-from .test_wheel import ride as gps_ride
+from .rides import VEHICLE, gps_ride, ride
 
 GOOD = """schema = 1
 [cooling]

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.calibration.table import UNITS, Measurements, Named, read_columns, read_table
+from gz_onboard.calibration.table import UNITS, Named, read_columns, read_table
 from gz_onboard.errors import InputError
 from gz_onboard.toml import Table as Toml
 
@@ -143,10 +143,3 @@ def test_a_file_that_cannot_be_read(tmp_path, name):
         (tmp_path / name).write_bytes(b"\xff\xfe\x00rubbish")
     with pytest.raises(InputError, match=re.escape(str(tmp_path / name))):
         read_table(tmp_path / name)
-
-
-def test_a_missing_column_of_a_table_made_by_hand():
-    table = Measurements(Path("made"), {"voltage": np.array([1.0])})
-    assert "voltage" in table
-    with pytest.raises(InputError, match=r"made: no column for 'voltag' \(did you mean 'voltage'\?\)"):
-        table["voltag"]
