@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import html
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +16,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.fit import correlation
 from gz_onboard.calibration.result import Curve, Fit, Found, Panel, Result
-from gz_onboard.reports.page import drawn, html_table, write_page
+from gz_onboard.reports.page import html_table, write_page
 from gz_onboard.reports.results import descriptions
-from gz_onboard.reports.style import MUTED, new_figure, rule
+from gz_onboard.reports.style import MUTED, new_figure, rule, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -265,12 +267,19 @@ def fit_row(fit: Fit) -> list[str]:
 
 
 def picture(panel: Panel) -> str:
-    """A panel as an HTML figure."""
+    """Draw a panel as an HTML figure, in few colours: as SVG, tens of panels of thousands of marks make megabytes."""
+    from PIL import Image
+
     figure = new_figure(6.2, 3.4)
     figure.set_layout_engine("constrained")
     _draw(figure.add_subplot(), panel)
-    title = f"<figcaption><b>{html.escape(panel.title)}</b></figcaption>"
-    return f"<figure>{title}{drawn(figure, panel.title)}</figure>"
+    png, webp = io.BytesIO(), io.BytesIO()
+    write(figure, png, "png", dpi=72)
+    few = Image.open(png).convert("RGB").quantize(20, dither=Image.Dither.NONE)
+    few.save(webp, "webp", lossless=True, quality=100, method=6)
+    title, data = html.escape(panel.title), base64.b64encode(webp.getvalue()).decode("ascii")
+    shown = f'<img class="drawn" alt="{title}" src="data:image/webp;base64,{data}">'
+    return f"<figure><figcaption><b>{title}</b></figcaption>{shown}</figure>"
 
 
 def _draw(axis: Axes, panel: Panel) -> None:
@@ -289,7 +298,6 @@ def _draw(axis: Axes, panel: Panel) -> None:
             label=trace.label or None,
             markersize=3 if points else 5,
             linewidth=1.3,
-            rasterized=points,  # thousands of marks are smaller as pixels
         )
         labels += bool(trace.label)
     if labels:

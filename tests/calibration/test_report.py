@@ -55,7 +55,7 @@ def test_the_page_needs_nothing_else_and_says_all(tmp_path):
     words = " ".join(page.words)
     for said in ("A & B", "0.500 ± 0.030", "runs <1> & 2", "two runs (held out)", "0.9900", "+0.50", "± 3 %", "a note"):
         assert said in words
-    assert {"svg", "meta"} <= set(page.tags)
+    assert {"img", "meta"} <= set(page.tags)
     assert file.stat().st_size < 100_000
     again = tmp_path / "s.html"
     write_report(again, "A & B", [a_result()])
