@@ -218,3 +218,12 @@ def later():
 def test_no_part_has_the_name_of_a_function_of_the_api():
     """Importing ``gz_onboard.discover`` would hide the function ``gz_onboard.discover``."""
     assert not {part_of(module) for module in MODULES} & set(gz_onboard.__all__)
+
+
+def test_a_class_name_has_one_meaning():
+    names: dict[str, list[str]] = {}
+    for module in MODULES:
+        for node in ast.walk(ast.parse((PACKAGE / module).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                names.setdefault(node.name, []).append(str(module))
+    assert {name: where for name, where in names.items() if len(where) > 1} == {}

@@ -255,7 +255,7 @@ def open_circuit(table: Measurements, cutoff: float = 0.0) -> Result:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class OcvSweep:
     """A slow discharge and the charge that belongs to it; `down` and `up` are their samples, `up` may be empty.
 
     before, last: rows before the discharge and at its end. rested: before the discharge. charged [A·h]: brought back.
@@ -298,7 +298,7 @@ class Sweep:
         return level
 
 
-def _find_sweep(test: CellTest, result: Result) -> Sweep:
+def _find_sweep(test: CellTest, result: Result) -> OcvSweep:
     """The longest discharge of `test` and its charge, without that if it is no counterpart, which `result` then says.
 
     Raises InputError for no discharge, one that is too fast or in pieces, or a charge that no cell takes.
@@ -333,11 +333,11 @@ def _find_sweep(test: CellTest, result: Result) -> Sweep:
     charged = float(drawn[max(rows[0] - 1, 0)] - drawn[rows[-1]]) if len(rows) else 0.0
     current = float(np.mean(test.current[down]))
     return _paired(
-        Sweep(test, down, up, before, last, rested, hours, current, capacity, charged, max(float(ohm), 0.0)), result
+        OcvSweep(test, down, up, before, last, rested, hours, current, capacity, charged, max(float(ohm), 0.0)), result
     )
 
 
-def _paired(sweep: Sweep, result: Result) -> Sweep:
+def _paired(sweep: OcvSweep, result: Result) -> OcvSweep:
     """`sweep` without a charge that is no counterpart of its discharge, or with that by its own charge."""
     test, c = sweep.test, SLOW_TEST
     if not np.any(sweep.up):
@@ -394,7 +394,7 @@ def _branches(test: CellTest) -> tuple[Mask, Mask]:
     return down, after if np.any(after) else longest(-1)
 
 
-def _half_gap(sweep: Sweep, result: Result) -> tuple[Sweep, Array]:
+def _half_gap(sweep: OcvSweep, result: Result) -> tuple[OcvSweep, Array]:
     """(`sweep`, its resistance none if it is more than the gap holds; half the gap [V] at the nodes, or nan)."""
     if not np.any(sweep.up):
         result.notes.append("hysteresis is not identifiable without a charge branch")
@@ -414,7 +414,7 @@ def _half_gap(sweep: Sweep, result: Result) -> tuple[Sweep, Array]:
     return replace(sweep, resistance=0.0), half
 
 
-def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
+def _between(sweep: OcvSweep, half: Array, result: Result) -> tuple[Array, Array]:
     """(voltage, its sd) [V] at the nodes: the discharge moved up by half the gap, where that is known or near."""
     c, discharge, soc = SLOW_TEST, _at_nodes(sweep, sweep.down), OCV_SOC
     resistive, both = sweep.resistive, np.isfinite(half)
@@ -440,7 +440,7 @@ def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
     return value, np.where(ends & ~np.isfinite(sd), np.nanmax(sd), sd)
 
 
-def _at_nodes(sweep: Sweep, branch: Mask) -> Array:
+def _at_nodes(sweep: OcvSweep, branch: Mask) -> Array:
     """Voltage at the nodes: a straight line through the samples nearest to each; nan where there are none."""
     level, volts, soc = sweep.level[branch], sweep.test.voltage[branch], OCV_SOC
     order, result = np.argsort(level), np.full(len(soc), np.nan)
@@ -454,7 +454,7 @@ def _at_nodes(sweep: Sweep, branch: Mask) -> Array:
     return result
 
 
-def _ends(sweep: Sweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
+def _ends(sweep: OcvSweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
     """Full and empty are where the cell rested, if it did: there the branches differ by their transients most."""
     c, test, last = SLOW_TEST, sweep.test, sweep.last
     value[-1] = sweep.full

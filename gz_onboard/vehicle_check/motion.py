@@ -29,7 +29,7 @@ PLACE = ("latitude", "longitude")
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionCheckConfig:
     """Tolerances. Recorded rides: 29 are within 0.8 % of the GPS, three with soft tyres 1.1 %."""
 
     apart: float = 0.04  # relative, of two ways that agree
@@ -45,7 +45,7 @@ class MotionConfig:
     rough: float = 0.2  # relative tolerance of a unit told by accelerations
 
 
-SETTINGS = MotionConfig()
+SETTINGS = MotionCheckConfig()
 FORWARD = ("accel_x",)
 TURNING = Expected(
     "turning against course",

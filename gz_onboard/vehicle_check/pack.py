@@ -55,7 +55,7 @@ CURRENTS = Expected(
 
 
 @dataclass(frozen=True)
-class PackConfig:
+class PackCheckConfig:
     """Tolerances."""
 
     above_full: float = 1.02  # of the full cell's voltage, that cells which give current do not exceed for long
@@ -74,7 +74,7 @@ class PackConfig:
     counted: float = 0.06  # of a state of charge, that is compared
 
 
-SETTINGS = PackConfig()
+SETTINGS = PackCheckConfig()
 
 
 @dataclass(frozen=True)
