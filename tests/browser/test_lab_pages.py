@@ -50,7 +50,7 @@ def test_it_fits_phone_and_desktop_day_and_night(browser: BrowserContext, tmp_pa
             page.goto(file.as_uri())
             assert page.evaluate("document.documentElement.scrollWidth") == width
             assert page.evaluate("getComputedStyle(document.body).backgroundColor") == ground
-            assert page.evaluate("[...document.querySelectorAll('svg.drawn')].every((e) => e.clientWidth > 300)")
+            assert page.evaluate("[...document.querySelectorAll('.drawn')].every((e) => e.clientWidth > 300)")
             scrolled = (
                 "[...document.querySelectorAll('table, .drawn')].filter((e) => !e.closest('.scroll') && "
                 "e.getBoundingClientRect().right > innerWidth).length"

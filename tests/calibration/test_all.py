@@ -33,7 +33,7 @@ def test_its_page_is_small_and_shows_no_picture_twice(made):
     text = made[0].with_name("report.html").read_text()
     pictures = re.findall(r"<figure>.*?</figure>", text, re.S)
     assert len(pictures) == len(set(pictures)) > 70
-    assert len(text.encode()) < 2_500_000
+    assert len(text.encode()) < 500_000
 
 
 def test_it_is_the_file_that_is_shipped(made):

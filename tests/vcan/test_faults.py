@@ -6,16 +6,19 @@ import os
 import signal
 import socket
 import struct
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import pytest
 
 from gz_onboard import state
+from gz_onboard.can.recorder import is_complete
 from gz_onboard.events import State
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
 from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
@@ -262,3 +265,88 @@ def test_stopped_for_long_it_tells_nothing_old(running: Running, listener: Liste
     daemon.stop()
     soc = [row["soc"] for row in daemon.estimates() if row["soc"] is not None]
     assert all(abs(b - a) < 0.002 for a, b in pairwise(soc))
+
+
+def test_two_channels(running: Running, listener: Listener):
+    daemon = running.daemon(channels=("vcan0", "vcan1"))
+    with steady_ride("vcan0", "vcan1"):
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+        time.sleep(3)
+    summary = daemon.stop()
+    frames = raw_frames(daemon.logs[-1])
+    assert number(summary, r"received (\d+)") == len(frames)
+    assert {frame[3] for frame in frames if frame[1] < 0x400} == {0}
+    assert {frame[3] for frame in frames if frame[1] >= 0x400} == {1}
+    assert all(b[0] >= a[0] for a, b in pairwise(frames))  # in the order of time, whatever the channel
+    assert not number(summary, r"dropped (\d+)")
+    assert daemon.estimates()[-2]["speed"] == pytest.approx(10.0, abs=0.01)
+
+
+@pytest.mark.administers
+@pytest.mark.skipif(not Path("/run/vcan-guest").is_dir(), reason="sets the clock: only in a guest")
+def test_the_clock_is_set(running: Running, listener: Listener):
+    started = time.clock_gettime(time.CLOCK_BOOTTIME)
+    daemon = running.daemon()
+    real = time.clock_gettime(time.CLOCK_BOOTTIME)
+    begin = time.time()
+
+    def set_clock(ahead: float) -> None:
+        now = begin + time.clock_gettime(time.CLOCK_BOOTTIME) - real
+        time.clock_settime(time.CLOCK_REALTIME, now + ahead)
+
+    try:
+        with steady_ride(), hold_ups() as held_up:
+            listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+            for ahead in (3600.0, -7200.0, 40.0):
+                set_clock(ahead)
+                time.sleep(4)
+                assert listener.decoded("RANGE_Status")[-1]["time"] == pytest.approx(time.time(), abs=1.0)
+    finally:
+        set_clock(0.0)
+    wait_for(lambda: daemon.journal.count("the clock was set") == 4, 5, "the daemon says that the clock was set")
+    daemon.stop()
+    elapsed = time.clock_gettime(time.CLOCK_BOOTTIME) - started
+    rows = daemon.estimates()
+    steps = [b["time"] - a["time"] for a, b in pairwise(rows)]
+    # A busy machine may hold the daemon up, but no time is in the log that did not pass, and none comes twice.
+    assert median(steps) == pytest.approx(1.0, abs=0.11)
+    assert min(steps) > 0.5, [round(step, 2) for step in steps]
+    assert sum(steps) < elapsed, [round(step, 2) for step in steps]
+    riding = [row for row in rows if row["speed"] is not None]
+    worse = [(row["state"], row["reasons"]) for row in riding[2:-2] if row["state"] != "VALID"]
+    assert not worse or max(held_up) > 0.5, worse  # a machine so busy holds up the sender, too
+    assert all(0 < b["distance"] - a["distance"] < 12 for a, b in pairwise(riding))
+    assert "implausible time" not in daemon.statuses()[-1]["faults"]
+    soc = [row["soc"] for row in riding if row["soc"] is not None]
+    assert max(soc) - min(soc) < 0.005
+
+
+@pytest.mark.administers
+def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
+    """Others fill it, and room again: the log leaves them their share, and goes on in a new file."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=False, capture_output=True
+    )
+    if mount.returncode:
+        pytest.skip(f"no mount here: {mount.stderr.decode()}")
+    try:
+        daemon = running.daemon("--log-dir", str(disk))
+        with steady_ride():
+            listener.wait_for_valid(4)
+            assert not listener.decoded("RANGE_Status")[-1]["RANGE_LogFailed"]
+            (disk / "ballast").write_bytes(bytes(1_800_000))
+            listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
+            wait_for(lambda: "cannot write the log" in daemon.journal, 10, "it says that the disk is full")
+            (disk / "ballast").unlink()
+            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
+            time.sleep(3)
+        daemon.stop()
+        logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+        assert len(logs) >= 2
+        assert all(is_complete(log) for log in logs)
+        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))
+    finally:
+        running.kill()
+        subprocess.run(["umount", str(disk)], check=False)
