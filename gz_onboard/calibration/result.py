@@ -16,7 +16,7 @@ class LackingError(InputError):
 
 @dataclass(frozen=True)
 class Found:
-    """A parameter as found; the names and units are those of `physics.parameters`."""
+    """A parameter as found; the names and units are those of `model.parameters`."""
 
     value: float
     sd: float

@@ -111,7 +111,7 @@ class CellEffects:
 class Temperatures:
     """Remembers the cells' temperature, and how much warmer than the air their heat has made them.
 
-    A temperature that is not measured follows the pack's cooling network (`physics.drawable.pack_constants`), which is
+    A temperature that is not measured follows the pack's cooling network (`model.drawable.pack_constants`), which is
     exact over any step.
     """
 

@@ -7,7 +7,7 @@ An effect file has
 - ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are quantities (names from
   `QUANTITIES`). Its keyword arguments are its parameters, those of the vehicle (`VEHICLE_PARAMETERS`) or those of the
   package's other effects. It is pure and takes floats and numpy arrays alike: operators, ``abs``, and the elementary
-  functions of `physics.functions`;
+  functions of `model.functions`;
 - if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, by which its state decays over
   ``dt`` [s]. The value of the effect is then the state x, 0 at the start, which follows the term:
   x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;

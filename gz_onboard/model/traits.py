@@ -1,4 +1,4 @@
-"""Traits of an effect that only offline tools read, from its file: see `physics.effect` for their meaning."""
+"""Traits of an effect that only offline tools read, from its file: see `model.effect` for their meaning."""
 
 from __future__ import annotations
 
