@@ -305,7 +305,7 @@ def since(happens: Mask) -> Array:
 
 
 def vibration(times: Array, values: Array, grid: Array) -> Array:
-    """Roughness of the road [m/s²] at `grid`, from vertical acceleration `values` at `times`; see `Vibration`."""
+    """Roughness of the road [m/s²] at `grid`, from vertical acceleration `values` at `times`; see `model.sensors`."""
     steps = np.diff(times)
     mean = relaxation(values[1:], np.exp(-steps / VIBRATION_PERIOD_S), float(values[0]))
     square = relaxation((values[1:] - mean) ** 2, np.exp(-steps / VIBRATION_MEMORY_S))

@@ -244,7 +244,7 @@ class ActivityTracker:
 
 
 class VibrationMonitor:
-    """The vibration, as `recording.sensors.Vibration` defines it [m/s²], from windows of samples.
+    """The vibration, as `model.sensors` defines it [m/s²], from windows of samples.
 
     It starts again after a gap, or with a sensor that shows one and the same value: no accelerometer is that still.
     """
@@ -262,7 +262,7 @@ class VibrationMonitor:
         dt = now - self._time
         if square < MOTION.min_vibration_square or dt > 2 * WINDOW:
             self._since, self._square = now, max(square, 0.0)
-        keep = exp(-WINDOW / n / VIBRATION_PERIOD_S)  # of white shaking, `Vibration` shows this share
+        keep = exp(-WINDOW / n / VIBRATION_PERIOD_S)  # of white shaking, the filters show this share
         fade = exp(-min(dt, WINDOW) / VIBRATION_MEMORY_S)
         self._square = fade * self._square + (1 - fade) * square * keep * keep * 2 / (1 + keep)
         self._time = now

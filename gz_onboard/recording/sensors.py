@@ -1,14 +1,13 @@
-"""A ride's sensor readings, corrected and put to use: columns, the best speed, the roughness of the road."""
+"""A ride's sensor readings, corrected and put to use: columns and the best speed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import exp
 from typing import Any
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.model.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S, speed_factors, true_current, true_voltage
+from gz_onboard.model.sensors import speed_factors, true_current, true_voltage
 
 Columns = Mapping[str, tuple[Array, Array]]
 
@@ -43,35 +42,3 @@ def speed_role(name: str, columns: Columns, parameters: Mapping[str, float]) -> 
         if role in columns:
             return role, factor
     raise InputError(f"{name}: has no speed; it needs one of {', '.join(factors)}")
-
-
-class Vibration:
-    """RMS [m/s²] of the vertical acceleration faster than `VIBRATION_PERIOD_S`, over about `VIBRATION_MEMORY_S`.
-
-    For samples at 30 Hz or more. Two first-order filters, each exact for any time between samples. The estimator, the
-    discovery and the simulated sensors share this definition of how rough a road is.
-    """
-
-    __slots__ = ("_mean", "_square", "_step", "_weights")
-
-    def __init__(self) -> None:
-        self._mean: float | None = None
-        self._square = 0.0
-        self._step = 0.0
-        self._weights = (0.0, 0.0)
-
-    def update(self, dt: float, accel_z: float) -> None:
-        """Add a sample [m/s²], `dt` [s] after the last."""
-        if self._mean is None:
-            self._mean = accel_z
-            return
-        if abs(dt - self._step) > 1e-4:  # samples come evenly: the weights hold for most of them
-            self._step, self._weights = dt, (1 - exp(-dt / VIBRATION_PERIOD_S), 1 - exp(-dt / VIBRATION_MEMORY_S))
-        fast, slow = self._weights
-        self._mean += fast * (accel_z - self._mean)
-        self._square += slow * ((accel_z - self._mean) ** 2 - self._square)
-
-    @property
-    def value(self) -> float:
-        """The RMS [m/s²]."""
-        return float(self._square**0.5)

@@ -192,7 +192,7 @@ ROLLER: tuple[SimulatedSensor, ...] = (
 def shaken(sensor: SimulatedSensor, truth: Truth, period: float) -> Array | None:
     """Standard deviation of the vibration of the road at the sensor [its unit] at each step; None without any.
 
-    White, sampled each `period` [s], of the size that `recording.sensors.Vibration` makes the truth's vibration of.
+    White, sampled each `period` [s], whose filtered size (`model.sensors`) is the truth's vibration.
     """
     if sensor.signal != "IMU_AccelZ" or not truth["vibration"].any():
         return None

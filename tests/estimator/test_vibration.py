@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from itertools import groupby
-from math import floor
+from math import exp, floor
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from gz_onboard.estimator.motion import MOTION, VibrationMonitor
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import WINDOW, Group, RoleWindow
 from gz_onboard.model.effect import load_effect
-from gz_onboard.recording.sensors import Vibration
+from gz_onboard.model.sensors import VIBRATION_MEMORY_S, VIBRATION_PERIOD_S
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.life import GROUPS, STEP, Scooter
 from tests.events import EventEstimator
@@ -35,6 +35,38 @@ NEWTONS = 8.0  # N per m/s²
 SHAKEN = [*GROUPS, Group("Shaken", ("accel_z",), 0.01)]
 AT = len(GROUPS)
 TYPICAL = BASE.riding.vibration
+
+
+class Vibration:
+    """RMS [m/s²] of the vertical acceleration faster than `VIBRATION_PERIOD_S`, over about `VIBRATION_MEMORY_S`.
+
+    For samples at 30 Hz or more. Two first-order filters, each exact for any time between samples. The definition of
+    how rough a road is, against which estimator, discovery and simulated sensors are checked.
+    """
+
+    __slots__ = ("_mean", "_square", "_step", "_weights")
+
+    def __init__(self) -> None:
+        self._mean: float | None = None
+        self._square = 0.0
+        self._step = 0.0
+        self._weights = (0.0, 0.0)
+
+    def update(self, dt: float, accel_z: float) -> None:
+        """Add a sample [m/s²], `dt` [s] after the last."""
+        if self._mean is None:
+            self._mean = accel_z
+            return
+        if abs(dt - self._step) > 1e-4:  # samples come evenly: the weights hold for most of them
+            self._step, self._weights = dt, (1 - exp(-dt / VIBRATION_PERIOD_S), 1 - exp(-dt / VIBRATION_MEMORY_S))
+        fast, slow = self._weights
+        self._mean += fast * (accel_z - self._mean)
+        self._square += slow * ((accel_z - self._mean) ** 2 - self._square)
+
+    @property
+    def value(self) -> float:
+        """The RMS [m/s²]."""
+        return float(self._square**0.5)
 
 
 def vehicle_with(folder: Path, port: str = "WHEEL_FORCE", value: float = NEWTONS) -> Vehicle:
