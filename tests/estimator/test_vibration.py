@@ -32,8 +32,9 @@ def term(vibration, *, rough_road):
     return rough_road * vibration
 """
 NEWTONS = 8.0  # N per m/s²
-SHAKEN = [*GROUPS, Group("Shaken", ("accel_z",), 0.01)]
-AT = len(GROUPS)
+TICKING = [*GROUPS, Group("Brake", ("brake_switch",), 0.01)]  # without it windows would end with the samples of shaking
+SHAKEN = [*TICKING, Group("Shaken", ("accel_z",), 0.01)]
+AT = len(TICKING)
 TYPICAL = BASE.riding.vibration
 
 
@@ -153,6 +154,7 @@ def test_whatever_comes_it_is_none_or_a_possible_number(steps, after):
 def events(seconds, vibration, lost=lambda t: False):
     """The scooter's ride with shaking of `vibration` [m/s²] in accel_z, from the first second on."""
     both = [*Scooter(offset=0.0, period=0.1).live(seconds, 9.0)]
+    both += [(STEP * i / 10 + 0.0002, AT - 1, (0.0,)) for i in range(10, round(seconds / STEP) * 10)]
     both += [(t + 0.0005, AT, (None if lost(t) else z,)) for t, z in shaken(seconds, vibration, begin=STEP)]
     return sorted(both, key=lambda event: event[0])
 
@@ -189,8 +191,9 @@ def test_the_road_load_is_that_of_the_shaking(rough, quiet):
 
 def test_missing_or_implausible_it_is_the_typical(rough, quiet):
     base, way = modelled(quiet)
+    found = []
     for rows, groups in (
-        ([row for row in events(240, 2.5) if row[1] != AT], GROUPS),  # a vehicle without
+        ([row for row in events(240, 2.5) if row[1] != AT], TICKING),  # a vehicle without
         ([row for row in events(240, 2.5) if row[1] != AT], SHAKEN),  # nothing came
         (events(240, 2.5, lambda t: True), SHAKEN),  # implausible or dropped, all of it
         ([row for row in events(240, 2.5) if row[1] != AT or round(row[0], 2) * 10 % 1 < 0.05], SHAKEN),  # at 10 Hz
@@ -198,7 +201,25 @@ def test_missing_or_implausible_it_is_the_typical(rough, quiet):
         e = estimated(rough, rows, groups)
         energy, ridden = modelled(e)
         assert e.load.vibration(240.0) == TYPICAL
-        assert energy / ridden - base / way == pytest.approx(NEWTONS * TYPICAL, rel=0.15)
+        found.append(energy / ridden)
+        assert found[-1] - base / way == pytest.approx(NEWTONS * TYPICAL, rel=0.15)
+    assert max(found) < 1.001 * min(found)
+
+
+def test_lost_midway_it_goes_over_to_the_typical_and_back(rough):
+    e, seen = estimated(rough, []), {}
+    for event in events(120, 2.5, lambda t: 50 < t < 70):
+        e.handle(event)
+        seen[round(event[0])] = e.load.vibration(event[0])
+    assert seen[49] == pytest.approx(2.5, rel=0.2)
+    assert seen[60] in (TYPICAL, 0.0)
+    assert seen[74] in (TYPICAL, 0.0)
+    assert seen[90] == pytest.approx(2.5, rel=0.2)
+
+
+def test_slow_motion_is_no_vibration():
+    hills = [(0.01 * i, 9.81 + 2.0 * math.sin(0.01 * i)) for i in range(2000)]
+    assert fed(hills).value(19.99) < 0.3
 
 
 def test_what_was_learned_outlives_a_restart(rough):
