@@ -412,7 +412,7 @@ def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
 
 
 def errors(line: LinearRide, theta: Array) -> dict[str, float]:
-    """The metrics of `Gain` of one ride with parameters `theta` (p,), as far as they are known."""
+    """The metrics of `Gain` of one ride with parameters `theta` (p,), no range without a positive modelled energy."""
     more, square = 0.0, 0.0
     found: dict[str, float] = {}
     for name, table in line.tables.items():
@@ -447,7 +447,9 @@ def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
     uneven = [split for split in constancy if split.unequal]
     if uneven and (best is None or not best.denies):
         worst = max(uneven, key=lambda split: split.chi2)
-        best = curve_over_split(now, worst) or ride_to_ride(now, worst, constancy)
+        best = curve_over_split(now, worst)
+        if best is None and any(split.of_ride and split.cause == worst.cause for split in constancy):
+            best = ride_to_ride(now, worst, constancy)
     if best is None or not best.denies:
         return best
     denied = dict.fromkeys([*best.denies, *(split.cause for split in uneven)])
@@ -747,7 +749,7 @@ def measure_gain(
     rows: dict[str, list[list[float]]] = {}
     for models in held_out(mixed, lines, after, form=form, folds=folds):
         each = [errors(line, theta) for line, theta in models]
-        for metric in each[0]:
+        for metric in (name for name in each[0] if all(name in found for found in each)):
             rows.setdefault(metric, []).append([found[metric] for found in each])
     rng = np.random.default_rng(seed)
     held = tuple(lines[i].ride.name for fold in folds for i in fold)

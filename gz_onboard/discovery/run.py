@@ -45,8 +45,9 @@ def discover(
     notes = [*notes, *left]
     apart = [ride for ride in found if ride.name in holdout]
     found = [ride for ride in found if ride.name not in holdout]
-    if not found:
-        raise InputError("every ride is held out: none is left to look into")
+    for rides_left, use in ((found, "fitted"), (apart, "held out")):
+        if not rides_left and (holdout or use == "fitted"):
+            raise InputError(f"no ride that was to be {use} can be used: {'; '.join(left)}")
     progress(f"{len(found)} rides, {len(mixed.names)} parameters")
     if not mixed.healthy:
         notes.append(

@@ -47,7 +47,6 @@ class SearchConfig:
     scatter_rounds: int = 25  # of expectation and maximisation
     worse: float = 0.1  # ln of a mean square on rides held out: scatter
     say: float = 0.1  # share of the evidence: a channel with less has no say
-    rejections: int = 6  # names at most that are tried and refused
     ratio_sd: float = 0.15  # by which the effect of a real cause differs between halves, on all rides
     ratio_ride_sd: float = 0.25  # and from ride to ride
     ratio: float = 0.5  # beyond which half of a cause is missing in one of the halves
@@ -494,10 +493,7 @@ def rejection(now: Search) -> Rejected | None:
 def accepted(search: Search) -> Search:
     """The causes of `search` that can be accepted: without each that is rejected it is searched again."""
     now = search.selected()
-    for _ in range(SEARCH.rejections):
-        bad = rejection(now) if now.chosen else None
-        if bad is None:
-            break
+    while now.chosen and (bad := rejection(now)):
         rejected = (*now.rejected, bad)
         search = replace(search, causes={name: c for name, c in search.causes.items() if name != bad.name})
         now = replace(search.selected(), rejected=rejected)
@@ -518,7 +514,9 @@ def search_causes(problem: Search) -> Search:
         return replace(now, winds=winds)
     causes = {name: cause for name, cause in now.causes.items() if name != wind.name}
     windy = accepted(with_winds(replace(problem, causes=causes), winds))
-    return replace(windy, rejected=now.rejected + windy.rejected, winds=winds)
+    rejected = {refused.name: refused for refused in (*now.rejected, *windy.rejected)}
+    refused = tuple(one for name, one in rejected.items() if name not in windy.chosen)
+    return replace(windy, rejected=refused, winds=winds)
 
 
 def own_winds(now: Search, wind: Candidate) -> Winds:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -126,3 +127,9 @@ def test_rides_held_out_by_name_have_no_part_in_anything():
     assert report.ranking == alone.ranking
     with pytest.raises(InputError, match="no ride is left"):
         discover(vehicle, rides, holdout=["city_14C", "city_34C"])
+    short = replace(
+        rides[1], columns={role: (times[:100], values[:100]) for role, (times, values) in rides[1].columns.items()}
+    )
+    for use, name in (("held out", "city_34C"), ("fitted", "city_14C")):
+        with pytest.raises(InputError, match=f"no ride that was to be {use} can be used: .*city_34C"):
+            discover(vehicle, [rides[0], short], holdout=[name])
