@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 _COLOURS = ("#1f6feb", "#d1495b", "#2a9d8f", "#e9a03b", "#7b5ea7", "#52606d", "#8c564b", "#17a2b8")
-_MOST_POINTS = 1000  # of a trace: more than a picture of 600 px shows
+_MOST_POINTS = 4000  # of a trace: more than a picture shows
 _MOST_OPEN = 8  # panels of a procedure: more are behind a click
 _MOST_TIED = 12  # parameters: a table of more correlations is not read
 

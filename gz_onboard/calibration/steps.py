@@ -86,11 +86,19 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Sequence[st
             found[slot] = logs_among(group)
     for slot, needed in slots.items():
         needed.check(name, slot, len(found.get(slot, ())))
+    if twice := fitted_and_held_out(found):
+        raise InputError(f"--with held_out={twice}: is in the data too; a file cannot be both fitted and held out")
     for file in (file for group in found.values() for file in group):
         if not file.is_file():
             what = "is a folder; give the files in it" if file.is_dir() else f"no such file{near_file(file)}"
             raise InputError(f"{file}: {what}")
     return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, values)
+
+
+def fitted_and_held_out(files: Mapping[str, Sequence[Path]]) -> str:
+    """Return the name of a file that is in the slots `data` and `held_out`, or an empty text."""
+    fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
+    return min((file.name for file in fitted & held), default="")
 
 
 def number_options(name: str) -> dict[str, float]:
@@ -150,10 +158,8 @@ def _manifest_step(table: Table, name: str) -> Step:
     slots, defaults = PROCEDURES[name].slots, PROCEDURES[name].options
     table.only([*slots, *defaults, "columns", *(f"{slot}_columns" for slot in slots)])
     files = {slot: _files(table, slot) for slot in slots if slot in table.values}
-    fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
-    if both := fitted & held:
-        twice = min(file.name for file in both)
-        raise table.error(f"names {twice}, which is in data too: a fitted file is not held out", "held_out")
+    if twice := fitted_and_held_out(files):
+        raise table.error(f"names {twice}, which is in data too: a file cannot be both fitted and held out", "held_out")
     for slot, needed in slots.items():
         try:
             needed.check(name, slot, len(files.get(slot, ())))

@@ -111,6 +111,7 @@ def test_a_folder_of_rides_is_its_logs(tmp_path, capsys):
         (["coastdown", "motor_dyno.csv.gz", "motor_emf_ramp.csv.gz"], "motor_dyno.csv.gz: no column for 'time'"),
         (["motor", "motor_dyno.csv.gz", "--output", "none/x.toml"], "there is no folder none"),
         (["motor", "motor_dyno.csv.gz", "--vehicle", "refrence"], r"no such vehicle file; .*did you mean 'reference'"),
+        (["pulse", "cell_pulse_25C.csv.gz", "--with", "held_out=cell_pulse_25C.csv.gz"], "both fitted"),
         (["all", "..", ".."], "all takes one folder"),
         (["wheel", "../../dbc"], "dbc: this folder holds no log"),
         (["all", "..", "--with", "held_out=x"], "from the manifest"),

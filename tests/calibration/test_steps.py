@@ -64,7 +64,7 @@ def test_steps_come_in_the_order_of_the_procedures(folder):
         (
             "airflow",
             'held_out = "./b.blf"\nairflow',
-            r"cooling.held_out: names b.blf, .* a fitted file is not held out",
+            r"cooling.held_out: names b.blf, .* cannot be both fitted and held out",
         ),
         ('[coastdown]\ndata = ["b.blf", ', "[coastdown]\ndata = [", r"coastdown needs .*2 or more\), has 1"),
         ('"a.csv"', '["a.csv", "b.blf"]', r"losses.data: losses takes 1 for data \(steady points.*\), has 2"),
