@@ -72,7 +72,7 @@ validation: setup  ## the recorded rides of the repository against their simulat
 hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/results/reliability.md
 	$(PYTHON_IN_VENV) -m tests.hardening
 
-mutants: setup  ## 300 wrong lines, one at a time: do the tests notice each? (25 minutes)
+mutants: setup  ## 300 wrong lines, one at a time: do the tests notice each?
 	$(PYTHON_IN_VENV) -m tests.mutants
 
 clean:  ## remove what the other targets made, except runs/
