@@ -8,7 +8,7 @@ import re
 import time
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, astuple
 from datetime import UTC, datetime
 from math import isfinite
@@ -22,7 +22,8 @@ from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.model.battery import Battery
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-from tests.hardening.report import Report
+from tests.hardening import Report
+from tests.hardening.flips import damaged
 from tests.support import LOGS, ROOT
 
 TITLE = "Malformed vehicle files, DBC files and manifests of a calibration"
@@ -185,73 +186,40 @@ def keys(text: str, rng: random.Random) -> tuple[str, set[str]]:
 
 
 def lines(text: str, rng: random.Random) -> str:
-    """The text with some of its lines cut, doubled, moved, or merged."""
+    """The text with some of its lines cut, doubled, left out, moved or merged."""
     rows = text.splitlines(keepends=True)
     for _ in range(rng.choice((1, 1, 2, 5))):
-        at = rng.randrange(len(rows))
-        change = rng.choice(("cut", "double", "drop", "move", "end", "merge", "repeat"))
-        if change == "cut":
-            rows[at] = rows[at][: rng.randrange(len(rows[at]) + 1)] + rng.choice(("", "\n"))
-        elif change == "double":
-            rows.insert(rng.randrange(len(rows)), rows[at])
-        elif change == "drop":
-            rows[at] = ""
-        elif change == "move":
-            rows[at], other = rows[rng.randrange(len(rows))], rows[at]
-            rows.append(other)
-        elif change == "end":
-            del rows[at + 1 :]
-        elif change == "merge":
-            rows[at] = rows[at].rstrip("\n")
-        else:
-            rows[at] *= rng.choice((3, 300))
+        at, other = rng.randrange(len(rows)), rng.randrange(len(rows))
+        row = rows[at]
+        rows[at] = rng.choice((row[: rng.randrange(len(row) + 1)] + "\n", "", row.rstrip("\n"), 3 * row, 300 * row))
+        if rng.random() < 0.3:
+            rows.insert(other, row)
     return "".join(rows)
 
 
-def damaged(text: str, rng: random.Random) -> bytes:
-    """The text with bytes flipped, taken out or put in, or cut off."""
-    data = bytearray(text.encode())
-    for _ in range(rng.choice((1, 2, 10, 100))):
-        if not data:
-            break
-        at = rng.randrange(len(data))
-        change = rng.random()
-        if change < 0.5:
-            data[at] ^= 1 << rng.randrange(8)
-        elif change < 0.7:
-            del data[at : at + rng.choice((1, 3, 40))]
-        elif change < 0.9:
-            data[at:at] = rng.choice((b"\0", b"\xff", b'"', b"'", b"{", b"[", b"=", b"\n", b"\r", b";", b"|", b"@"))
-        elif change < 0.95:
-            del data[at:]
-        else:
-            data[at:at] = rng.randbytes(30)
-    return bytes(data)
+LAYOUTS = tuple(
+    f"{start}|{length}@{order}"
+    for start in (0, 1, 7, 8, 63, 64, 511, 100_000)
+    for length in (0, 1, 2, 8, 33, 64, 65, 100_000)
+    for order in ("0+", "0-", "1+", "1-")
+)
+IN_DBC: dict[str, tuple[str, Sequence[str]]] = {
+    "dbc numbers": (r"(?<![\w.])-?\d+(?:\.\d+)?", NUMBERS),
+    "dbc names": (
+        r"\b[A-Za-z]\w+\b|[@+|:;\[\](),-]",
+        (*NAMES, *re.findall(r"(?:SG|BO)_ (?:\d+ )?(\w+)", DBC["vehicle.dbc"])),
+    ),
+    "dbc layout": (r"\d+\|\d+@[01][+-]", LAYOUTS),
+}
+"""What is replaced in a DBC file, and by what."""
 
 
-def numbers(text: str, rng: random.Random) -> str:
-    """The DBC with one to three of its numbers replaced."""
+def replaced(text: str, rng: random.Random, kind: str) -> str:
+    """The DBC with one to three of its numbers, names or places of signals replaced."""
+    pattern, values = IN_DBC[kind]
     for _ in range(rng.choice((1, 1, 2, 3))):
-        found = rng.choice(list(re.finditer(r"(?<![\w.])-?\d+(?:\.\d+)?", text)))
-        text = text[: found.start()] + rng.choice(NUMBERS) + text[found.end() :]
-    return text
-
-
-def names(text: str, rng: random.Random) -> str:
-    """The DBC with a name, a unit or a sign replaced: here alone, or wherever it stands."""
-    found = rng.choice(list(re.finditer(r"\b[A-Za-z]\w+\b|[@+|:;\[\](),-]", text)))
-    new = rng.choice((*NAMES, *re.findall(r"(?:SG|BO)_ (?:\d+ )?(\w+)", text)))
-    if rng.random() < 0.3:
-        return text.replace(str(found[0]), str(new))
-    return text[: found.start()] + str(new) + text[found.end() :]
-
-
-def layout(text: str, rng: random.Random) -> str:
-    """The DBC with the place, length or order of bits of some signals changed: overlapping, too long, beyond it."""
-    for _ in range(rng.choice((1, 1, 3))):
-        found = rng.choice(list(re.finditer(r"\d+\|\d+@[01][+-]", text)))
-        start, length = rng.choice((0, 1, 7, 8, 63, 64, 511, 100_000)), rng.choice((0, 1, 2, 8, 33, 64, 65, 100_000))
-        text = f"{text[: found.start()]}{start}|{length}@{rng.choice('01')}{rng.choice('+-')}{text[found.end() :]}"
+        found = rng.choice(list(re.finditer(pattern, text)))
+        text = text[: found.start()] + rng.choice(values) + text[found.end() :]
     return text
 
 
@@ -339,10 +307,11 @@ def read_it(folder: Path, kind: str, rng: random.Random) -> tuple[Path, set[str]
     if kind in ("values", "manifest"):
         texts[name], named = keys(text, rng)
     elif kind in ("bytes", "dbc bytes"):
-        texts[name] = damaged(text, rng)
+        texts[name] = damaged(text.encode(), rng)
+    elif kind in IN_DBC:
+        texts[name] = replaced(text, rng, kind)
     else:
-        change = {"lines": lines, "dbc lines": lines, "dbc numbers": numbers, "dbc names": names, "dbc layout": layout}
-        texts[name] = change[kind](text, rng)
+        texts[name] = lines(text, rng)
     for file, content in texts.items():
         (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
 

@@ -8,7 +8,6 @@ some real ext4 is cut as well, where a guest can be had.
 
 from __future__ import annotations
 
-import logging
 import os
 import tempfile
 import threading
@@ -30,8 +29,7 @@ from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.readers.contents import LogDamage
-from tests.hardening import _ext4
-from tests.hardening.report import Report
+from tests.hardening import Report, _ext4, quiet
 from tests.support import S, Scooter, reference
 
 TITLE = "Power cuts while log and state are written"
@@ -205,21 +203,15 @@ def judge(cut: Cut, folder: Path, daemon: Daemon, found: Found) -> None:
 def run(count: int, seed: int) -> Report:
     """`count` cuts, twenty in each of some rides."""
     found = Found()
-    logger = logging.getLogger("gz-onboard")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
+    with quiet():
         for ride in range(-(-count // 20)):
             source = Random(f"{seed} {ride}")
-            number = min(20, count - 20 * ride)
             with tempfile.TemporaryDirectory() as folder:
-                made = cuts(number, source, Path(folder), f"seed {seed}, ride {ride}")
+                made = cuts(min(20, count - 20 * ride), source, Path(folder), f"seed {seed}, ride {ride}")
             daemon = Daemon(reference(), [], None, Path("scooter.json"))
             for cut in made:
                 with tempfile.TemporaryDirectory() as folder:
                     judge(cut, Path(folder), daemon, found)
-    finally:
-        logger.setLevel(level)
     rows = {
         "cuts": str(len(found.log_s)),
         f"of the log lost, at worst (promised: {LOG_S:g} s)": f"{max(found.log_s, default=0):.2f} s",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from gz_onboard.can.codec import Codec
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import Group
 from tests.events import Event, EventEstimator, events_of
-from tests.hardening.report import Report
+from tests.hardening import Report, quiet
 from tests.support import S, Scooter, check_estimate, reference
 
 TITLE = "A damaged saved state"
@@ -118,60 +118,58 @@ def run(count: int, seed: int) -> Report:
     estimator = _estimator()
     for event in _ride(70.0, ODOMETER):  # long enough for a piece of way
         estimator.handle(event)
-    snapshot = estimator.snapshot(reference().key)
-    assert snapshot is not None
-    snapshot = json.loads(json.dumps(snapshot))
-    older = {**snapshot, "soc": 0.123}
-    report = Report()
-    refused = before = odd_used = 0
-    logger = logging.getLogger("gz-onboard")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "scooter.json"
-            daemon = Daemon(reference(), [], None, file)
-            fresh = Daemon(reference(), [], None, file)
-            text, text_before = (state.encode(s, time.time()) for s in (snapshot, older))
-            for number in range(count):
-                case = f"seed {seed}, case {number}"
-                latest, previous = state.copies(file)
-                odd = number % 4 == 3
-                there = state.encode(with_odd_values(snapshot, source), time.time()) if odd else damaged(text, source)
-                same = not odd and there == text
-                latest.write_bytes(there)
-                keep = source.random() < 0.5
-                (previous.write_bytes(text_before) if keep else previous.unlink(missing_ok=True))
-                if source.random() < 0.3:
-                    file.with_suffix(".new").write_bytes(text[: source.randrange(len(text))])
-                try:
-                    found = (fresh if odd else daemon).restore()
-                except Exception as error:
-                    report.failures.append(f"{case}: raised {error!r}")
-                    continue
-                if odd:
-                    if found in (None, older):
-                        continue
-                    odd_used += 1
-                    try:
-                        ride_on(found, source)
-                    except Exception as error:
-                        report.failures.append(f"{case}: riding on raised {error!r}: {_difference(snapshot, found)}")
-                elif found is None:
-                    refused += 1
-                    if keep:
-                        report.failures.append(f"{case}: the state before was not used")
-                elif found == older and keep:
-                    before += 1
-                elif found != snapshot or not same:
-                    report.failures.append(f"{case}: values that were not saved were used")
-    finally:
-        logger.setLevel(level)
-    report.rows = {
+    snapshot = json.loads(json.dumps(estimator.snapshot(reference().key)))
+    previous = {**snapshot, "soc": 0.123}
+    outcomes: Counter[str] = Counter()
+    failures = []
+    with quiet(), tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scooter.json"
+        for number in range(count):
+            damage = odd_values if number % 4 == 3 else damaged_bytes
+            try:
+                outcomes[damage(file, snapshot, previous, source)] += 1
+            except Exception as error:
+                failures.append(f"seed {seed}, case {number}: {type(error).__name__}: {error}")
+    rows = {
         "cases": f"{count:,}",
-        "damaged bytes, refused": f"{refused:,}",
-        "damaged bytes, went on from the state before": f"{before:,}",
-        "odd values under a right checksum: plausible, ridden on with": f"{odd_used:,} of {count // 4:,}",
-        "altered values used, exceptions": str(len(report.failures)),
+        "damaged bytes, refused": f"{outcomes['refused']:,}",
+        "damaged bytes, went on from the state before": f"{outcomes['state before']:,}",
+        "odd values under a right checksum: plausible, ridden on with": f"{outcomes['odd']:,} of {count // 4:,}",
+        "altered values used, exceptions": str(len(failures)),
     }
-    return report
+    return Report(rows, failures)
+
+
+def damaged_bytes(file: Path, snapshot: dict[str, Any], previous: dict[str, Any], source: Random) -> str:
+    """What came of a state with damaged bytes, half of the times with a sound one before it."""
+    latest, before = state.copies(file)
+    text, text_before = (state.encode(values, time.time()) for values in (snapshot, previous))
+    there = damaged(text, source)
+    latest.write_bytes(there)
+    before.unlink(missing_ok=True)
+    keep = source.random() < 0.5
+    if keep:
+        before.write_bytes(text_before)
+    if source.random() < 0.3:
+        file.with_suffix(".new").write_bytes(text[: source.randrange(len(text))])
+    found = Daemon(reference(), [], None, file).restore()
+    if there == text:
+        return "unharmed"
+    assert found == (previous if keep else None), "not the state before"
+    return "state before" if keep else "refused"
+
+
+def odd_values(file: Path, snapshot: dict[str, Any], previous: dict[str, Any], source: Random) -> str:
+    """What came of a state with an odd value and a right checksum, a sound one before it."""
+    latest, before = state.copies(file)
+    latest.write_bytes(state.encode(with_odd_values(snapshot, source), time.time()))
+    before.write_bytes(state.encode(previous, time.time()))
+    found = Daemon(reference(), [], None, file).restore()
+    if found == previous:
+        return "state before"
+    assert found is not None
+    try:
+        ride_on(found, source)
+    except Exception as error:
+        raise AssertionError(f"{error!r}: {_difference(snapshot, found)}") from error
+    return "odd"

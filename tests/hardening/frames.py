@@ -27,7 +27,7 @@ from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.timeline import stray
 from gz_onboard.vehicle import Vehicle
 from tests.events import events_of
-from tests.hardening.report import Report
+from tests.hardening import Report
 from tests.support import EPOCH, MS, Run, S, check_sound, recorded, reference, sealed
 from tests.vehicles.test_other_vehicles import tlmoto_frames
 from tests.vehicles.test_other_vehicles import vehicle as other_vehicle

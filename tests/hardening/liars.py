@@ -18,7 +18,7 @@ from gz_onboard.can.codec import Codec
 from gz_onboard.events import Estimate, State
 from gz_onboard.recording.logs import read_frames
 from tests.events import Event, EventEstimator, events_of
-from tests.hardening.report import Report
+from tests.hardening import Report
 from tests.support import LOGS, reference
 
 TITLE = "Sensors that lie"
@@ -27,10 +27,10 @@ FULL_COUNT = 1000  # all that there are
 RIDE = "city_14C"
 BEGIN = 120.0  # s: when the lie begins; the ride lasts 732 s
 
-Lie = Callable[[float, float], float | None]
+Lie = Callable[[float, float], float]
 """What a sensor says, of (seconds since the lie began, what it should say)."""
 Fault = tuple[tuple[str, ...], str, Callable[[], Lie]]
-"""(the roles that lie, how, what makes the lie anew)."""
+"""(the roles that lie, how, what makes a new lie)."""
 
 
 def _stuck() -> Lie:
@@ -42,16 +42,6 @@ def _stuck() -> Lie:
         return first[0]
 
     return lie
-
-
-def _noise(size: float) -> Lie:
-    rng = random.Random(1)
-    return lambda t, value: value + rng.gauss(0, size)
-
-
-def _spikes(size: float) -> Lie:
-    rng = random.Random(1)
-    return lambda t, value: value + (10 * size if rng.random() < 0.02 else 0.0)
 
 
 def _late(seconds: float) -> Lie:
@@ -66,32 +56,35 @@ def _late(seconds: float) -> Lie:
     return lie
 
 
-def _plain(lie: Lie) -> Callable[[], Lie]:
-    return lambda: lie
+def _noise(size: float) -> Lie:
+    rng = random.Random(1)
+    return lambda t, value: value + rng.gauss(0, size)
 
 
-def _climbing(rate: float) -> Callable[[], Lie]:
-    return lambda: lambda t, value: value + rate * t
+def _spikes(size: float) -> Lie:
+    rng = random.Random(1)
+    return lambda t, value: value + (size if rng.random() < 0.02 else 0.0)
 
 
-def _off(size: float) -> Callable[[], Lie]:
-    return lambda: lambda t, value: value + size
+def _linear(factor: float = 1.0, offset: float = 0.0, rate: float = 0.0) -> Callable[[], Lie]:
+    """A gain, an offset and a drift [1/s]."""
+    return lambda: lambda t, value: factor * value + offset + rate * t
 
 
 def _kinds(size: float, full_scale: float) -> dict[str, Callable[[], Lie]]:
     """The usual lies; `size`: an offset that matters, in the role's unit."""
     return {
         "stuck": _stuck,
-        "zero": _plain(lambda t, v: 0.0),
-        "full scale": _plain(lambda t, v: full_scale),
-        "doubled": _plain(lambda t, v: 2 * v),
-        "halved": _plain(lambda t, v: v / 2),
-        "sign flipped": _plain(lambda t, v: -v),
-        "too high": _plain(lambda t, v: v + size),
-        "too low": _plain(lambda t, v: v - size),
-        "drifting": _plain(lambda t, v: v + size * t / 120),
+        "zero": _linear(0.0),
+        "full scale": _linear(0.0, full_scale),
+        "doubled": _linear(2.0),
+        "halved": _linear(0.5),
+        "sign flipped": _linear(-1.0),
+        "too high": _linear(offset=size),
+        "too low": _linear(offset=-size),
+        "drifting": _linear(rate=size / 120),
         "noise": lambda: _noise(size),
-        "spikes": lambda: _spikes(size),
+        "spikes": lambda: _spikes(10 * size),
         "2 s late": lambda: _late(2.0),
     }
 
@@ -110,26 +103,26 @@ SIZES = {  # an offset that matters, full scale
 }
 BOTH = "pack_current", "inverter_current"
 BY_HAND: list[Fault] = [
-    *((("gps_altitude",), f"climbing {rate:g} m/s", _climbing(rate)) for rate in (0.1, 0.3, 1.0, 3.0, -1.0)),
-    *((("accel_x",), f"{size:+g} m/s²", _off(size)) for size in (0.5, -0.5, 1.0, 5.0)),
-    (("pack_current",), "-300 A", _plain(lambda t, v: -300.0)),
-    (("pack_current",), "5 A too high", _plain(lambda t, v: v + 5.0)),
-    (("pack_current",), "5 A too low", _plain(lambda t, v: v - 5.0)),
-    (BOTH, "-300 A", _plain(lambda t, v: -300.0)),
-    (BOTH, "zero", _plain(lambda t, v: 0.0)),
+    *((("gps_altitude",), f"climbing {rate:g} m/s", _linear(rate=rate)) for rate in (0.1, 0.3, 1.0, 3.0, -1.0)),
+    *((("accel_x",), f"{size:+g} m/s²", _linear(offset=size)) for size in (0.5, -0.5, 1.0, 5.0)),
+    (("pack_current",), "-300 A", _linear(0.0, -300.0)),
+    (("pack_current",), "5 A too high", _linear(offset=5.0)),
+    (("pack_current",), "5 A too low", _linear(offset=-5.0)),
+    (BOTH, "-300 A", _linear(0.0, -300.0)),
+    (BOTH, "zero", _linear(0.0)),
     (BOTH, "stuck", _stuck),
-    (BOTH, "doubled", _plain(lambda t, v: 2 * v)),
-    (BOTH, "halved", _plain(lambda t, v: v / 2)),
-    (BOTH, "sign flipped", _plain(lambda t, v: -v)),
-    (("auxiliary_current",), "20 A too high", _plain(lambda t, v: v + 20.0)),
-    (("cell_temperature",), "85 °C", _plain(lambda t, v: 85.0)),
-    (("cell_temperature",), "-40 °C", _plain(lambda t, v: -40.0)),
-    (("cell_temperature",), "20 K too high", _plain(lambda t, v: v + 20.0)),
-    (("ambient_temperature",), "25 K too low", _plain(lambda t, v: v - 25.0)),
-    (("motor_temperature",), "214 °C", _plain(lambda t, v: 214.0)),
-    (("accel_z",), "zero", _plain(lambda t, v: 0.0)),
-    (("accel_y",), "+20 m/s²", _plain(lambda t, v: v + 20.0)),
-    (("rate_x",), "+1 rad/s", _plain(lambda t, v: v + 1.0)),
+    (BOTH, "doubled", _linear(2.0)),
+    (BOTH, "halved", _linear(0.5)),
+    (BOTH, "sign flipped", _linear(-1.0)),
+    (("auxiliary_current",), "20 A too high", _linear(offset=20.0)),
+    (("cell_temperature",), "85 °C", _linear(0.0, 85.0)),
+    (("cell_temperature",), "-40 °C", _linear(0.0, -40.0)),
+    (("cell_temperature",), "20 K too high", _linear(offset=20.0)),
+    (("ambient_temperature",), "25 K too low", _linear(offset=-25.0)),
+    (("motor_temperature",), "214 °C", _linear(0.0, 214.0)),
+    (("accel_z",), "zero", _linear(0.0)),
+    (("accel_y",), "+20 m/s²", _linear(offset=20.0)),
+    (("rate_x",), "+1 rad/s", _linear(offset=1.0)),
     (("rate_z",), "stuck", _stuck),
 ]
 GRACE = 60.0  # s: time of detection, some 500 m of a ride through town
