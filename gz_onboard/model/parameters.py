@@ -168,8 +168,6 @@ SIMULATION_PARAMETERS = (
         grows_with="mass wheel_radius",
     ),
     Parameter("front_brake_share", "1", 0.65, 0.1, 0, 1, "of the braking torque; the rear wheel is unloaded"),
-    Parameter("brake_viscous_constant", "N·s/rad", 60, 20, 0, 50000, "C_b of Lord 2016, eq. 2.13", grows_with="mass"),
-    Parameter("brake_disc_radius", "m", 0.09, 0.02, 0.01, 0.5, "a disc of 200 mm", grows_with="wheel_radius"),
     Parameter("tyre_b", "1", 10.0, 3.0, 1, 40, "Pacejka 2012, ch. 4: with c and d a slip stiffness of 16 per load"),
     Parameter("tyre_c", "1", 1.65, 0.1, 1, 2.5, "Pacejka 2012, ch. 4: longitudinal"),
     Parameter("tyre_d", "1", 1.0, 0.15, 0.1, 2, "dry asphalt"),
@@ -232,6 +230,8 @@ SIMULATION_PARAMETERS = (
 )
 
 
+REMOVED = {"brake_viscous_constant", "brake_disc_radius", "yaw_inertia", "tyre_relaxation_length"}
+"""Parameters of earlier vehicle files that nothing reads."""
 MOST_CELLS = 1000  # in series, or in parallel
 USUAL_CELLS = {"cells_series": 14, "cells_parallel": 12}  # in the pack of the scooter that the priors describe
 
@@ -295,6 +295,8 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
     """The parameters in the vehicle file, or their priors. InputError naming line and value."""
     declared = declared_parameters(effects)
     table = vehicle.table("parameters")
+    for name in sorted(REMOVED.intersection(table.values)):
+        raise table.error("nothing reads this parameter any more: delete the line", name)
     table.only(declared)
     given = {name: _given(table, declared[name]) for name in table.values}
     if "battery" in vehicle.values:

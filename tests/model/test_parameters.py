@@ -27,6 +27,7 @@ def vehicle(tmp_path: Path, old: str, new: str):
         (r"^drag_area = \{ value = [\d.]+", "drag_area = { value = 99.0", ["drag_area", "99", "m²", "0.05 to 8"]),
         (r'^(drag_area = .*unit = )"m²"', r'\1"cm²"', ["drag_area", "cm²", "m²"]),
         (r"^drag_area", "drag_aera", ["drag_aera", "did you mean 'drag_area'"]),
+        (r"^drag_area", "yaw_inertia", ["yaw_inertia", "nothing reads this parameter", "delete the line"]),
         (r'^(drag_area = .*status = )"\w+"', r'\1"measuerd"', ["measuerd", "did you mean 'measured'"]),
         (r"^(drag_area = .*), sd = [\d.]+", r"\1", ["drag_area", "sd", "missing"]),
         (r"^soc = \[0\.0, 0\.005", "soc = [0.005, 0.0", ["battery.ocv", "must increase", "0"]),
