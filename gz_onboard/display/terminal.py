@@ -90,7 +90,7 @@ def _other_screen(out: TextIO) -> Iterator[None]:
 def screen(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Line]:
     """Lay out the whole picture for a terminal of `width` columns. comments: of the DBC file, by signal."""
     width = max(min(width, WIDEST), INDENT + 4)
-    late, ranges, battery, used = picture["late"], picture["range"], picture["battery"], picture["consumption"]
+    ranges, battery, used = picture["range"], picture["battery"], picture["consumption"]
     colour, state = _STATES[picture["state"]]
     if waiting := "waiting" in picture["alerts"]:
         state = "waiting for the scooter"
@@ -101,21 +101,18 @@ def screen(picture: Picture, width: int, comments: Mapping[str, str]) -> list[Li
     source = f"{picture['channel']} ({picture['interface']}){'' if picture['bus_up'] else ' is down'}"
     red = soc is not None and soc <= NEARLY_EMPTY
 
-    def of_message(message: str, label: str, text: str, codes: str = _BOLD) -> Line:
-        return label, text, _DIM if message in late else codes
-
     lines = [
         ("gz-onboard", source, _DIM),
         _EMPTY,
-        of_message("RANGE_Estimate", "Range", f"{km}     80 %: {p10} to {p90}", f"{_BOLD};{colour}"),
+        ("Range", f"{km}     80 %: {p10} to {p90}", f"{_BOLD};{colour}"),
         _EMPTY,
-        of_message("RANGE_Status", "State of charge", charged, f"{_BOLD};{_RED}" if red else _BOLD),
-        of_message("RANGE_Energy", "Energy left", _text(battery["energy_left_wh"], ".0f", "Wh")),
-        of_message("RANGE_Energy", "Consumption", f"{expected} expected, {recent} over the last km"),
+        ("State of charge", charged, f"{_BOLD};{_RED}" if red else _BOLD),
+        ("Energy left", _text(battery["energy_left_wh"], ".0f", "Wh"), _BOLD),
+        ("Consumption", f"{expected} expected, {recent} over the last km", _BOLD),
     ]
     if picture["causes"]:
         why = ", ".join(f"{cause_words(one['cause'])} {one['km']:+.1f} km" for one in picture["causes"])
-        lines.append(of_message("RANGE_Why", "Why", why, _PLAIN))
+        lines.append(("Why", why, _PLAIN))
         lines.append(("", f"besides the charge; rated {_text(picture['rated_km'], '.1f', 'km')}", _DIM))
     lines += [_EMPTY, ("State", state, f"{_BOLD};{colour}")]
     if picture["activity"]:

@@ -24,7 +24,6 @@ from gz_onboard.model.sensors import speed_factors
 from gz_onboard.model.tables import Derating
 from gz_onboard.vehicle import Vehicle
 
-LATE_PERIODS = 3  # of a message, after which its values are shown in grey; after STALE_PERIODS they are not shown
 CELLS, ODOMETER = "cell_temperature", "odometer"
 CELL_ROLES = "coldest_cell_temperature", CELLS, "hottest_cell_temperature"
 POSITION_ROLES = "latitude", "longitude", "gps_altitude", "gps_fix"
@@ -86,7 +85,9 @@ class VehicleFrames:
     def values(self, now: float, distrusted: Container[str] = ()) -> dict[str, Any]:
         """The values by their names in the picture; None if unknown, stale, or of a sensor that is `distrusted`."""
         fresh = {
-            role: found[0] for role, found in self._latest.items() if self._periods_old(role, now) <= STALE_PERIODS
+            role: value
+            for role, (value, came, _) in self._latest.items()
+            if now - came <= STALE_PERIODS * self._period[role]
         }
         cells = [fresh[role] for role in CELL_ROLES if role in fresh and CELLS not in distrusted]
         metres = None if ODOMETER in distrusted else fresh.get(ODOMETER)
@@ -108,14 +109,6 @@ class VehicleFrames:
         altitude = fresh.get("gps_altitude") if fix >= FIX_3D else None
         where = {"latitude": fresh["latitude"], "longitude": fresh["longitude"], "altitude": altitude}
         return {"time_ns": self._latest["longitude"][2], **where}
-
-    def late(self, now: float) -> list[str]:
-        """`CELLS` and `ODOMETER` if their values are overdue, but not yet stale."""
-        overdue = {role for role in self._latest if LATE_PERIODS < self._periods_old(role, now) <= STALE_PERIODS}
-        return [name for name, roles in ((CELLS, CELL_ROLES), (ODOMETER, (ODOMETER,))) if overdue & {*roles}]
-
-    def _periods_old(self, role: str, now: float) -> float:
-        return (now - self._latest[role][1]) / self._period[role]
 
 
 def cell_limits(derating: Derating) -> tuple[float, float]:

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.can.layout import crc8_sae_j1850, raw_range
+from gz_onboard.can.layout import MessageSignals, crc8_sae_j1850, raw_range
 from gz_onboard.can.publisher import KNOWN, Publisher, reason_signal, sensor_signal
-from gz_onboard.display.vehicle_frames import LATE_PERIODS, VehicleFrames
+from gz_onboard.display.vehicle_frames import VehicleFrames
 from gz_onboard.events import (
     NO_PACK,
     NO_SENSOR,
@@ -62,39 +62,36 @@ class ReceivedMessage:
     """The last good frame of one message, and counts of its frames."""
 
     def __init__(self, definition: Message) -> None:
-        name, signals = definition.name, definition.signals
+        name = definition.name
         # The DBC file says it in milliseconds, or not at all.
         self.period = (definition.cycle_time or (100 if name == "RANGE_Status" else 1000)) / 1000  # s
         self.time = -math.inf  # s, of the last good frame
         self.values: dict[str, float | None] = {}  # of the last good frame, in the units of the DBC file
         self.received = self.lost = self.bad = 0  # lost: by the counter; bad: failed a check
-        self._definition = definition
-        self._limits = {s.name: raw_range(s, not_available=True) for s in signals}
-        self._scales = {s.name: (float(s.conversion.scale), float(s.conversion.offset)) for s in signals}
-        self._counter = 0
+        self._signals = MessageSignals(definition)
+        self._counter_name = f"{name}Counter"
+        self._counts = raw_range(definition.get_signal_by_name(self._counter_name), not_available=True)[1] + 1
+        self._counter = 0.0
 
-    def periods_old(self, now: float) -> float:
-        """The age of its values at `now` [s], in periods."""
-        return (now - self.time) / self.period
+    def is_stale(self, now: float) -> bool:
+        """Whether its values are too old to show at `now` [s]."""
+        return now - self.time > STALE_PERIODS * self.period
 
     def take(self, data: bytes, now: float) -> None:
         """Take a frame that came at `now`; one that fails a check is counted and not used."""
-        message = self._definition
-        if len(data) != message.length or crc8_sae_j1850(data[:-1]) != data[-1]:
+        values = self._signals.values(data)
+        if values is None or crc8_sae_j1850(data[:-1]) != data[-1]:
             self.bad += 1
             return
-        raw: dict[str, Any] = message.decode_simple(data, decode_choices=False, scaling=False)
-        counter = int(raw[f"{message.name}Counter"])
-        if self.periods_old(now) <= STALE_PERIODS:
-            step = (counter - self._counter) % (int(self._limits[f"{message.name}Counter"][1]) + 1)
+        counter = values[self._counter_name] or 0.0
+        if not self.is_stale(now):
+            step = int(counter - self._counter) % int(self._counts)
             if step == 0:  # a repeated frame: the sender may hang
                 self.bad += 1
                 return
             self.lost += step - 1
         self._counter, self.time, self.received = counter, now, self.received + 1
-        for name, (low, high) in self._limits.items():
-            scale, offset = self._scales[name]
-            self.values[name] = round(raw[name] * scale + offset, 3) if low <= raw[name] <= high else None
+        self.values = {name: None if value is None else round(float(value), 3) for name, value in values.items()}
 
 
 class View:
@@ -127,8 +124,7 @@ class View:
 
     def picture(self, now: float, channel: str, interface: str, bus_up: bool) -> Picture:
         """Return the picture at `now`; channel, interface, bus_up: the bus that it is of, and whether that is up."""
-        old = {name: message.periods_old(now) for name, message in self.messages.items()}
-        stale = [name for name, periods in old.items() if periods > STALE_PERIODS]
+        stale = [name for name, message in self.messages.items() if message.is_stale(now)]
         fresh = [message.values for name, message in self.messages.items() if name not in stale]
         values = {signal: value for found in fresh for signal, value in found.items()}
 
@@ -193,8 +189,6 @@ class View:
             "reasons": [name for bit, name, _ in _REASONS if bit & reasons],
             "lost": [name for bit, name, _ in _REASONS if bit & lost],
             "distrusted": distrusted,
-            "late": [name for name, periods in old.items() if periods > LATE_PERIODS]
-            + (self._vehicle.late(now) if self._vehicle else []),
             "stale": stale,
             "age_s": round(age, 3) if math.isfinite(age) else None,
             "counts": {

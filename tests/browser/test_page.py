@@ -103,8 +103,6 @@ def test_the_days_distance_and_the_cells(page):
         assert goal == pytest.approx((12.5 + 18.3) / 62.5 * 100, abs=0.1)
         sender.own = [cells(22, 40, 52)]
         shows(page, alerts="Battery cell too hot: 52 °C.", cells="cells 22 to 52 °C")
-        late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
-        wait_for(lambda: page.evaluate(late) == ["ridden"], "the odometer is late")
         shows(page, ridden="")
         assert page.is_hidden("#band .behind")
         sender.own = [cells(-8, -7, -7)]
@@ -122,9 +120,6 @@ def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
             shows(page, range_value="34", soc_value="62", alerts="")
         shows(page, soc_value="–", range_value="34", alerts="Some values are no longer updated.")
         assert "no update from:" in texts(page)["missing"]
-        late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
-        wait_for(lambda: set(page.evaluate(late)) >= {"range", "energy", "consumption", "why"}, "what is late, as such")
-        assert page.evaluate("getComputedStyle(document.querySelector('#range .figure')).fontStyle") == "italic"
         shows(page, trust_word="unknown", energy="895 Wh left", range_value="34")
         shows(page, range_value="–", alerts="Range estimator stopped responding.")
         assert numbers(page) == []

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from gz_onboard.can.publisher import Publisher, sensor_signal
 from gz_onboard.display.server import STATIC
-from gz_onboard.display.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.display.view import ALERTS, NEARLY_EMPTY, NO_LONGER_EMPTY, NO_NEWS, Picture, View, encoded
 from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.display.test_terminal import COUNTS, ESTIMATE, second, seen
@@ -67,7 +66,6 @@ def test_every_number_of_the_frames():
         "reasons": ["no_imu", "prior_riding"],
         "lost": [],
         "distrusted": [],
-        "late": [],
         "stale": [],
         "alerts": [],
         "age_s": 0.0,
@@ -106,13 +104,6 @@ def test_an_old_number_is_not_given(after, gone, stay):
     }
     assert not any(has[name] for name in gone)
     assert all(has[name] for name in stay)
-
-
-def test_what_is_late_is_said():
-    assert of(ESTIMATE, 100.2)["late"] == []
-    assert of(ESTIMATE, 100.4)["late"] == ["RANGE_Status"]
-    assert set(of(ESTIMATE, 104.0)["late"]) == set(View().messages)
-    assert of(ESTIMATE, 104.0)["stale"] == ["RANGE_Status"]
 
 
 @pytest.mark.parametrize(
@@ -233,7 +224,7 @@ def test_there_is_a_word_for_everything(language):
         "activities": [activity.name.lower() for activity in Activity],
         "reasons": [str(reason.name).lower() for reason in Reason],
         "causes": [cause.name.lower() for cause in Cause if cause],
-        "messages": [*View().messages, CELLS, ODOMETER],
+        "messages": [*View().messages],
         "sensors": [r for r in ROLES if sensor_signal(r) in Publisher().messages["RANGE_Sensors"].signal_tree],
     }
     for group, names in groups.items():

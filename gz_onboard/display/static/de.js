@@ -40,7 +40,6 @@ export default {
   "wider": "Bereich weiter:",
   "left_out": "nicht verwendete Sensoren:",
   "stale": "keine neuen Werte:",
-  "late": "verspätet:",
   "settings": {
     "theme": {"auto": "Tag/Nacht: auto", "day": "Tag", "night": "Nacht"},
     "unit": {"km": "Kilometer", "mi": "Meilen"},
@@ -109,8 +108,7 @@ export default {
   "messages": {
     "RANGE_Estimate": "Reichweite", "RANGE_Energy": "Energie und Verbrauch",
     "RANGE_Status": "Ladezustand und Zustand", "RANGE_Diagnosis": "Zähler", "RANGE_Sensors": "Sensoren",
-    "RANGE_Why": "Ursachen", "RANGE_Route": "Route", "RANGE_Charge": "Laden",
-    "cell_temperature": "Zelltemperatur", "odometer": "Kilometerzähler"
+    "RANGE_Why": "Ursachen", "RANGE_Route": "Route", "RANGE_Charge": "Laden"
   },
   "sensors": {
     "pack_voltage": "Batteriespannung", "pack_current": "Batteriestrom", "inverter_voltage": "Umrichterspannung",

@@ -9,12 +9,7 @@ const NOTHING = {
   channel: "", state: null, activity: null, range: { km: null, p10_km: null, p90_km: null }, range_10min_km: [],
   battery: { soc_percent: null, soc_sigma_percent: null, energy_left_wh: null }, cells: null, speed_km_h: null, ridden_today_km: null,
   consumption: { recent_wh_per_km: null, expected_wh_per_km: null }, charge: null, route: null, rated_km: null,
-  causes: [], reasons: [], distrusted: [], late: [], stale: [], alerts: [], counts: null,
-};
-const SHOWN_BY = {  // the places that a message fills
-  RANGE_Estimate: ["range"], RANGE_Status: ["charge-level", "state"], RANGE_Energy: ["energy", "consumption"],
-  RANGE_Charge: ["charge"], RANGE_Route: ["route"], RANGE_Why: ["why"],
-  cell_temperature: ["cells"], odometer: ["ridden"],
+  causes: [], reasons: [], distrusted: [], stale: [], alerts: [], counts: null,
 };
 const KEEPING = ["log_failed", "save_failed"];
 const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?", waiting: "…" };
@@ -141,13 +136,8 @@ function drawState(picture, problem) {
   const because = said(state === "valid" ? words().wider : words().because, { state: word("states", state) });
   bullets("reasons", because, why.filter((name) => !waiting || !name.startsWith("no_")).map((name) => word("reasons", name)));
   bullets("distrusted", words().left_out, picture.distrusted.map((name) => word("sensors", name)));
-  const named = (names) => names.map((name) => word("messages", name));
-  const late = picture.late.filter((name) => !picture.stale.includes(name));
-  bullets("missing", picture.stale.length ? words().stale : words().late, named(picture.stale.length ? picture.stale : late));
+  bullets("missing", words().stale, picture.stale.map((name) => word("messages", name)));
   put("frames", picture.counts ? said(words().frames, picture.counts) : DASH);
-  for (const [message, places] of Object.entries(SHOWN_BY)) {
-    for (const place of places) byId(place).classList.toggle("late", late.includes(message));
-  }
   document.body.classList.toggle("gone", Boolean(problem));
 }
 

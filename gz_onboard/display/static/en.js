@@ -40,7 +40,6 @@ export default {
   "wider": "wider interval:",
   "left_out": "sensors ignored:",
   "stale": "no update from:",
-  "late": "late:",
   "settings": {
     "theme": {"auto": "Day/night: auto", "day": "Day", "night": "Night"},
     "unit": {"km": "Kilometres", "mi": "Miles"},
@@ -109,7 +108,7 @@ export default {
   "messages": {
     "RANGE_Estimate": "range", "RANGE_Energy": "energy and consumption", "RANGE_Status": "state of charge and state",
     "RANGE_Diagnosis": "counts", "RANGE_Sensors": "sensors", "RANGE_Why": "causes", "RANGE_Route": "route",
-    "RANGE_Charge": "charge", "cell_temperature": "cell temperature", "odometer": "odometer"
+    "RANGE_Charge": "charge"
   },
   "sensors": {
     "pack_voltage": "pack voltage", "pack_current": "pack current", "inverter_voltage": "inverter voltage",
