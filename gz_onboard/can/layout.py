@@ -41,7 +41,7 @@ def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:
     elif not_available and bits >= 8:
         low, high = (low + 1, high) if signal.is_signed else (low, high - 1)
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
-        limits = max(float(signal.minimum), -FARTHEST), min(float(signal.maximum), FARTHEST)
+        limits = float(max(signal.minimum, -FARTHEST)), float(min(signal.maximum, FARTHEST))  # some have 400 digits
         ends = sorted((limit - offset) / scale for limit in limits)
         slack = 0 if conversion.is_float else 1e-6  # limits are decimal fractions
         low, high = max(low, ends[0] - slack), min(high, ends[1] + slack)

@@ -480,6 +480,13 @@ SIG_VALTYPE_ 257 Twice : 2;
 FLOAT_ROLES = 'pack_voltage = "Single"\npack_current = "Bare"\ncell_temperature = "Twice"'
 
 
+def test_a_limit_of_hundreds_of_digits_bounds_nothing(tmp_path):
+    dbc = f'BO_ 256 M: 2 A\n SG_ V : 0|16@1+ (0.1,0) [-{"9" * 400}|{"9" * 400}] "V" A\n'
+    codec = Codec(mapping_of(tmp_path, dbc, 'pack_voltage = "V"'))
+    (event,) = events_of(codec, [(0, 256, bytes((0x20, 3)), 0)])
+    assert event[2] == (80.0,)
+
+
 def test_floats(tmp_path):
     codec = Codec(mapping_of(tmp_path, FLOATS, FLOAT_ROLES))
     cases = [
