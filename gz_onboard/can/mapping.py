@@ -257,7 +257,7 @@ def _source(messages: Sequence[Message], left_out: LeftOut, roles: Table, role: 
     found = [(m, s) for m in among for s in m.signals if s.name == name]
     if not found:
         known = [s.name for m in among for s in m.signals]
-        where = f"message {of} has no signal" if of else "no message has a signal"
+        where = f"message {of} has no signal" if of else "no message in dbc has a signal"
         raise table.error(f"{where} {shown(name)}{nearest(name, known)}", key)
     if len(found) > 1:
         several = ", ".join(m.name for m, _ in found)
