@@ -11,12 +11,9 @@ from hypothesis import strategies as st
 from gz_onboard.can.codec import RANGE, Codec
 from gz_onboard.can.requests import SEQUENCE, Assembler
 from gz_onboard.events import Frame
-from gz_onboard.export.decoder import Decoder
-from gz_onboard.pipeline import Pipeline
-from gz_onboard.vehicle import read_vehicle
 from tests.events import Event, events_of
-from tests.polled import KONA, STEADY, answer, carried, exchange, kona, payload, request
-from tests.support import EPOCH, MS, S
+from tests.polled import STEADY, answer, carried, exchange, kona, request
+from tests.support import EPOCH, MS
 
 PAYLOADS = st.binary(min_size=1, max_size=200)
 BATTERY = request("Battery")
@@ -84,34 +81,6 @@ def test_the_answer_is_an_event_of_its_last_frame():
     assert codec.values("Battery", codec.latest["Battery"][2])["BatteryVoltage"] == pytest.approx(365.0)
 
 
-def test_an_answer_is_worth_what_a_frame_is(tmp_path):
-    """The same values at the same times, sent unasked: the estimator cannot tell the difference."""
-    dbc = (
-        'VERSION ""\nBU_: A\nBO_ 256 Own: 7 A\n SG_ I : 7|16@0- (0.1,0) [-400|600] "A" A\n'
-        ' SG_ U : 23|16@0+ (0.1,0) [200|450] "V" A\n SG_ T : 39|8@0- (1,0) [-40|80] "degC" A\n'
-        ' SG_ N : 47|16@0- (1,0) [-12000|12000] "rpm" A\nBA_DEF_ BO_ "GenMsgCycleTime" INT 0 3600000;\n'
-        'BA_ "GenMsgCycleTime" BO_ 256 200;\n'
-    )
-    (tmp_path / "own.dbc").write_text(dbc)
-    text = KONA.read_text(encoding="utf-8")
-    begin, end = text.index("[[request]]"), text.index("[parameters]")
-    roles = '[roles]\npack_current = "I"\npack_voltage = "U"\ncell_temperature = "T"\nmotor_speed = "N"\n'
-    (tmp_path / "own.toml").write_text(f'{text[:begin]}dbc = ["own.dbc"]\n{roles}{text[end:]}')
-    asked, told = Pipeline(kona()), Pipeline(read_vehicle(tmp_path / "own.toml"))
-    for pipeline in (asked, told):
-        pipeline.advance([(EPOCH, 0x555, b"", 0)], EPOCH + MS)  # their clocks begin together
-    for i in range(250):
-        values = STEADY | {"BatteryCurrent": 20.0 + i % 7, "MotorSpeed": 3000 + i}
-        frames = answer(BATTERY, EPOCH + i * S // 5, **values)
-        data = payload(BATTERY, **values)[3:]
-        asked.advance(frames, frames[-1][0] + 60 * MS)
-        told.advance([(frames[-1][0], 0x100, data[10:14] + data[15:16] + data[53:55], 0)], frames[-1][0] + 60 * MS)
-    one, other = asked.last, told.last
-    assert one and other
-    assert one.range and other.range
-    assert (one.soc, one.range, one.distance) == (other.soc, other.range, other.distance)
-
-
 def test_all_ones_are_a_value_and_limits_are_checked():
     shown = request("BatteryShown")
     codec, events = decoded(answer(shown, EPOCH, BatteryCharge=100.0))
@@ -128,26 +97,3 @@ def test_a_gateway_that_repeats_the_answer_on_a_second_bus_does_no_harm():
     assert [event[2] for event in events] == [VALUES]
     assert not codec.faults
     assert len(decoded([(t, i, data, 1) for t, i, data, _ in frames])[1]) == 1  # a log of that bus alone
-
-
-FRAMES = st.one_of(
-    st.sampled_from(carried(payload(BATTERY, **STEADY))),
-    st.binary(max_size=8),
-    st.just(b"\x30\0\0\xaa\xaa\xaa\xaa\xaa"),
-)
-
-
-@given(st.lists(st.tuples(st.integers(0, S), FRAMES), max_size=40))
-@settings(max_examples=200)
-def test_fuzzed_frames_give_the_right_number_or_none(frames):
-    """Bytes at random can be an answer only if all of it is; a part of one is never filled up by another's."""
-    clock, sent = EPOCH, []
-    for step, data in frames:
-        clock += step
-        sent.append((clock, BATTERY.response, data, 0))
-    genuine = carried(payload(BATTERY, **STEADY))
-    codec, events = decoded(sent)
-    if all(data in genuine or data[:1] == b"\x30" for _, data in frames):
-        assert all(event[2] == VALUES for event in events)
-    assert codec.received == len(sent)
-    assert list(Decoder(kona().mapping).decode([sent])) is not None

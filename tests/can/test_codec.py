@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.can.codec import CONFLICT, COUNTER, CRC, LENGTH, LONGEST_PAUSE_NS, NOT_AVAILABLE, RANGE, TIME, Codec
-from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.can.layout import crc8_sae_j1850, identifiers_of
 from gz_onboard.can.mapping import BusMapping, Source, read_mapping, to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
@@ -106,18 +105,6 @@ def assert_like_cantools(codec: Codec, message, data: bytes, time_ns: int) -> No
             assert value == pytest.approx(want, rel=1e-12, abs=1e-12), (signal, raw[signal.name])
 
 
-INCOMING = load_database([find_dbc("vehicle.dbc"), find_dbc("hbm.dbc")])
-
-
-@pytest.mark.parametrize("name", [message.name for message in INCOMING.messages])
-@given(frames=st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=5))
-def test_every_message_of_the_reference_scooter_is_decoded_as_by_cantools(name, frames):
-    message = INCOMING.get_message_by_name(name)
-    codec = Codec(mapping_of_all(INCOMING, name))
-    for i, data in enumerate([*frames, bytes(8), b"\xff" * 8]):
-        assert_like_cantools(codec, message, data, i * MS)
-
-
 @st.composite
 def layouts(draw: st.DrawFn) -> str:
     """The DBC of a message of up to ten signals anywhere in it."""
@@ -159,28 +146,7 @@ def test_any_layout_is_decoded_as_by_cantools(dbc, data):
         assert_like_cantools(codec, message, frame, i * MS)
 
 
-def test_limits_are_kept_to_the_last_step():
-    codec = Codec(reference())
-    for i, (volts, good) in enumerate([(0.0, True), (100.0, True), (100.01, False), (655.34, False)]):
-        (event,) = events_of(codec, [pack(i, EPOCH + i * 100 * MS, BMS_PackVoltage=volts)])
-        assert value_of(codec, event, "pack_voltage") == (pytest.approx(volts) if good else None)
-        assert value_of(codec, event, "pack_current") == 0.0
-    assert codec.faults == {("BMS_Pack.BMS_PackVoltage", RANGE): 2}
-
-
 # --- not available --------------------------------------------------------------------------------------------
-
-
-def test_codes_for_not_available_are_no_numbers():
-    codec = Codec(reference())
-    (event,) = events_of(codec, [pack(0, EPOCH, BMS_PackVoltage=655.35, BMS_PackCurrent=-327.68, BMS_StateOfCharge=50)])
-    assert value_of(codec, event, "pack_voltage") is None
-    assert value_of(codec, event, "pack_current") is None
-    assert value_of(codec, event, "bms_state_of_charge") == pytest.approx(0.5)
-    assert codec.faults == {
-        ("BMS_Pack.BMS_PackVoltage", NOT_AVAILABLE): 1,
-        ("BMS_Pack.BMS_PackCurrent", NOT_AVAILABLE): 1,
-    }
 
 
 DBC_SHORT = """BO_ 256 M: 8 A
@@ -210,23 +176,6 @@ def test_a_flipped_bit_drops_the_frame(bit, counter, raw):
     assert events_of(codec, [(EPOCH, 0x200, bytes(data), 0)]) == []
     assert codec.faults == {("BMS_Pack", CRC): 1}
     assert codec.latest == {}
-
-
-def test_counters_count_and_wrap():
-    codec = Codec(reference())
-    events = events_of(codec, [pack(i % 15, EPOCH + i * 100 * MS) for i in range(40)])
-    assert len(events) == 40
-    assert not codec.faults and not codec.lost
-
-
-def test_a_small_step_is_frames_lost_and_a_repeated_or_far_counter_is_wrong():
-    codec = Codec(reference())
-    counters = [3, 4, 4, 7, 14, 0, 8, 9]
-    events = events_of(codec, [pack(c, EPOCH + i * 100 * MS) for i, c in enumerate(counters)])
-    # 4 -> 4 repeated; 4 -> 7: two lost; 7 -> 14: six lost; 0 -> 8: too far; 8 -> 9 follows
-    assert [round(time * 10) for time, _, _ in events] == [0, 1, 3, 4, 5, 7]
-    assert codec.faults == {("BMS_Pack", COUNTER): 2}
-    assert codec.lost == {"BMS_Pack": 8}
 
 
 def test_after_a_pause_any_counter_is_good_but_not_one_that_cannot_be():
@@ -259,7 +208,7 @@ def test_counters_by_their_rule(counters):
 # --- lengths, remote and error frames, unknown identifiers -----------------------------------------------------
 
 
-@pytest.mark.parametrize("length", [n for n in range(65) if n != 8])
+@pytest.mark.parametrize("length", [0, 7, 9, 64])
 def test_a_wrong_length_drops_the_frame(length):
     codec = Codec(reference())
     for identifier in (0x101, 0x200, 0x411):  # plain, protected, without a role
@@ -268,19 +217,14 @@ def test_a_wrong_length_drops_the_frame(length):
     assert codec.latest == {}
 
 
-def test_remote_and_error_frames_are_no_data():
+def test_remote_and_error_frames_and_other_identifiers_are_no_data():
     codec = Codec(reference())
-    frames = [(EPOCH, 0x101 | RTR_FLAG, bytes(8), 0), (EPOCH, 0x4 | ERR_FLAG, bytes(8), 0)]
+    others = [0x101 | RTR_FLAG, 0x101 | EFF_FLAG]  # 29 bits are another identifier than 11
+    frames = [(EPOCH, identifier, bytes(8), 0) for identifier in (*others, 0x4 | ERR_FLAG)]
     assert events_of(codec, frames * 3) == []
     assert codec.error_frames == 3
-    assert codec.unknown == {0x101 | RTR_FLAG: 3}
+    assert codec.unknown == dict.fromkeys(others, 3)
     assert not codec.faults
-
-
-def test_an_11_bit_identifier_is_not_the_29_bit_one():
-    codec = Codec(reference())
-    assert events_of(codec, [(EPOCH, 0x101 | EFF_FLAG, bytes(8), 0)]) == []
-    assert codec.unknown == {0x101 | EFF_FLAG: 1}
 
 
 def test_a_babbling_node_does_not_fill_the_memory():
@@ -296,13 +240,6 @@ def test_a_babbling_node_does_not_fill_the_memory():
 
 
 # --- time -----------------------------------------------------------------------------------------------------
-
-
-def test_times_are_seconds_since_the_first_frame():
-    codec = Codec(reference())
-    events = events_of(codec, [temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
-    assert [time for time, _, _ in events] == [0.0, 1.5]
-    assert codec.seconds(EPOCH + S) == 1.0
 
 
 def test_two_channels_may_overtake_each_other_a_little():
@@ -561,15 +498,6 @@ def test_a_page_that_the_dbc_does_not_list_keeps_the_signals_of_every_page(tmp_p
     rows = [row for _, _, row in Decoder(mapping).decode([frames])]
     assert [row["Cell[V]"] for row in rows] == [pytest.approx(3.7)] + [None] * 19
     assert all(row["Amps[A]"] == pytest.approx(-24.0) for row in rows)
-
-
-def test_multiplexed_messages_are_protected_too(tmp_path):
-    codec = Codec(mapping_of(tmp_path, MULTIPLEXED, MUX_ROLES, MUX_BUS))
-    good = mux(0, 3, struct.pack("<Hh", 5000, 0))
-    assert len(events_of(codec, [(0, 256, good, 0)])) == 1
-    assert events_of(codec, [(0, 256, good, 0)]) == []
-    assert events_of(codec, [(0, 256, good[:-1] + b"\0", 0)]) == []
-    assert codec.faults == {("Mux", COUNTER): 1, ("Mux", CRC): 1}
 
 
 # --- never an exception, never a wrong number ---------------------------------------------------------------------

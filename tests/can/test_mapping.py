@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.can.dbc import find_dbc, load_database
-from gz_onboard.can.mapping import BusMapping, pgn, read_mapping, to_si
+from gz_onboard.can.mapping import BusMapping, read_mapping, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.toml import Table
 
@@ -346,17 +346,6 @@ def test_wide_identifiers_without_bit_31_are_read_as_29_bits_and_said(tmp_path, 
     assert "v.dbc: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: 0x16a954a6" in record.message
 
 
-def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path):
-    file = tmp_path / "v.dbc"
-    for end in range(0, len(DBC), 3):
-        file.write_text(DBC[:end], encoding="utf-8")
-        try:
-            load_database([file])
-        except InputError as error:
-            assert str(error).startswith(f"{file}:")
-            assert "CM_" not in str(error)
-
-
 def test_a_dbc_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"none\.dbc: cannot be read: No such file"):
         load_database([tmp_path / "none.dbc"])
@@ -379,10 +368,3 @@ def test_parameter_groups_must_be_told_apart(tmp_path):
     message = complaint(tmp_path, dbc=dbc, bus='identifiers = "j1939"')
     for part in ("v.toml:3:", "Pack and Motor", "61444", 'identifiers = "exact"'):
         assert part in message
-
-
-def test_parameter_group_numbers():
-    assert pgn(0x0CF00400) == 61444  # EEC1
-    assert pgn(0x18FEF100) == 65265  # CCVS1
-    assert pgn(0x18EAFF21) == pgn(0x18EA0021) == 59904  # request, to all or to one
-    assert pgn(0x19FEF100) == 65536 + 65265  # data page 1

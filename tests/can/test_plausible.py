@@ -39,17 +39,6 @@ def codec(folder: Path, dbc: str = DBC, roles: str = ROLES_OF_IT) -> Codec:
     return Codec(read_mapping(Table.read(folder / "v.toml")))
 
 
-def test_a_state_of_charge_in_percent_without_its_unit_is_not_taken_for_one(tmp_path: Path):
-    dbc = DBC.replace('"degC"', '""')
-    roles = ROLES_OF_IT.replace("ambient_temperature", "bms_state_of_charge")
-    for raw, values in ((10, [1.0]), (650, [None])):  # 1.0 is full, 65 are percent
-        it = codec(tmp_path, dbc, roles)
-        ((_, group, found),) = events_of(it, [(10**18, 256, struct.pack("<hhf", raw, 300, 52.0), 0)])
-        named = dict(zip(it.groups[group].roles, found, strict=True))
-        assert [named["bms_state_of_charge"]] == values
-    assert it.faults == {("M.Ambient", RANGE): 1}
-
-
 def test_every_role_has_a_unit_of_which_it_is_said_what_is_plausible():
     assert set(ROLES.values()) == set(PLAUSIBLE)
     assert all(low <= 0 < high for low, high in PLAUSIBLE.values())

@@ -15,7 +15,7 @@ from gz_onboard.events import EFF_FLAG
 from gz_onboard.pipeline import range_publisher
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import events_of
-from tests.polled import KONA, STEADY, carried, kona, payload
+from tests.polled import KONA, STEADY, carried, payload
 from tests.support import EPOCH, MS
 
 TEXT = KONA.read_text(encoding="utf-8")
@@ -41,16 +41,6 @@ def refusal(file: Path) -> str:
 
 def line(part: str, occurrence: int = 0) -> int:
     return [number for number, text in enumerate(LINES, 1) if part in text][occurrence]
-
-
-def test_what_the_file_says():
-    battery, shown = kona().mapping.requests
-    assert (battery.request, battery.response) == (0x7E4, 0x7EC)
-    assert battery.prefix == b"\x62\x01\x01"
-    assert (shown.period, shown.message.length) == (10.0, 43)
-    assert kona().mapping.periods == {"Battery": 0.2, "BatteryShown": 10.0}
-    assert {source.role for source in kona().mapping.sources} >= {"pack_voltage", "pack_current", "motor_speed"}
-    assert kona().mapping.dbc_files == ()
 
 
 @pytest.mark.parametrize("bus", ["", '[bus]\nidentifiers = "j1939"\n'])
@@ -167,14 +157,3 @@ def with_signal(folder: Path, signal: str) -> Vehicle:
         (TEXT[TEXT.index("[roles]") : TEXT.index("[parameters]")], ""),
     )
     return read_vehicle(changed(folder, *changes))
-
-
-def test_answers_of_a_local_identifier_are_read(tmp_path: Path):
-    """Service 0x21 of ISO 14230, as a Nissan Leaf answers it: one byte of identifier."""
-    old = "service = 0x22\ndata_identifier = 0x0105"
-    codec = Codec(read_vehicle(changed(tmp_path, (old, "service = 0x21\ndata_identifier = 0x05"))).mapping)
-    battery = codec.mapping.requests[1]
-    assert battery.prefix == b"\x61\x05"
-    parts = enumerate(carried(payload(battery, BatteryCharge=60.0)))
-    (event,) = events_of(codec, [(EPOCH + i * MS, 0x7EC, part, 0) for i, part in parts])
-    assert event[2][0] == pytest.approx(0.6)
