@@ -44,7 +44,7 @@ from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TE
 from gz_onboard.options import LONGEST_LOG, MOST_PAYLOAD
 from gz_onboard.progress import Progress
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.logs import distinct_logs, logs_among
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable, table_of
@@ -480,7 +480,7 @@ def report(
     rides: logs, or folders of logs. route: file of the road that was to be ridden. located: whether the page shows
     where the rides were. progress: takes numbers of frames. InputError for a ride that cannot be used, or for none.
     """
-    known, logs = _vehicle(vehicle), _some(distinct_logs(_paths(rides)))
+    known, logs = _vehicle(vehicle), _some(logs_among(_paths(rides)))
     road = None if route is None else Path(route)
     found = [report_of(log, known, road, located, progress) for log in logs]
     return Reported(found, [known.file, *logs, *([] if road is None else [road])])
@@ -619,11 +619,15 @@ def validate(
     """Compare rides with their simulation: open loop, with the rider model, and each component alone.
 
     rides: logs, or folders of logs. vehicle: of one given by name or file, the payload is that of ``rides.json`` next
-    to the log. progress: takes bytes of the logs. InputError for a ride that cannot be judged, or for none.
+    to the log. progress: takes 1 for each ride. InputError for a ride that cannot be judged, or for none.
     """
-    logs = _some(list(dict.fromkeys(logs_among(_paths(rides)))))
-    known = ((log, _vehicle_on(log, vehicle)[0]) for log in logs)
-    return Validated([compare_ride(log, one, progress or (lambda _: None)).result for log, one in known])
+    logs = _some(logs_among(_paths(rides)))
+    found: list[ValidatedRide] = []
+    for log in logs:
+        found.append(compare_ride(log, _vehicle_on(log, vehicle)[0]).result)
+        if progress:
+            progress(1)
+    return Validated(found)
 
 
 # --- vehicle check --------------------------------------------------------------------------------------------------
@@ -671,7 +675,7 @@ def check_vehicle(
     progress: takes numbers of frames. InputError for a log that cannot be used.
     """
     known = _vehicle(vehicle)
-    found = [check_log(log, known, progress, quick) for log in distinct_logs(_paths(logs))]
+    found = [check_log(log, known, progress, quick) for log in logs_among(_paths(logs))]
     return CheckedVehicle(known, features_of({source.role for source in known.mapping.sources}), found)
 
 

@@ -1,4 +1,4 @@
-"""A function over rides, in processes of their own: results in order, progress of all, and no ride stops another."""
+"""A function over rides, in processes of their own: results in order, and no ride stops another."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import Value, active_children, parent_process
+from multiprocessing import active_children, parent_process
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, TypeVar
@@ -55,7 +55,7 @@ def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **op
 
     suffix: of a file that is written of each. InputError if two logs would be written as one.
     """
-    logs = list(dict.fromkeys(logs_among(arguments.logs)))
+    logs = logs_among(arguments.logs)
     names = distinct_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs])
     given = arguments.vehicle, arguments.payload, not arguments.no_plot, arguments.picture_format
     options |= {"vehicle_id": getattr(arguments, "vehicle_id", None)}
@@ -63,46 +63,39 @@ def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **op
 
 
 def over_rides(
-    function: Callable[[TaskT, Progress], Answer],
-    tasks: Sequence[TaskT],
-    jobs: int | None,
-    progress: Progress = lambda _: None,
+    function: Callable[[TaskT], Answer], tasks: Sequence[TaskT], jobs: int | None, progress: Progress = lambda _: None
 ) -> Iterator[tuple[TaskT, Answer | InputError]]:
     """Each task with what `function` answers, or with the InputError that it raises, in order.
 
-    function: of a task and of what counts its work, which reaches `progress`; to be found at the top of its module.
-    jobs: so many at a time, as many as there are processors if None.
+    function: a process must find it at the top of its module. jobs: so many at a time, as many as there are
+    processors if None. progress: takes 1 for each ride that is done.
     """
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(tasks))
     if jobs < 2:
         for task in tasks:
-            yield task, _attempt(function, task, progress)
+            answer = _attempt(function, task)
+            progress(1)
+            yield task, answer
         return
-    done = Value("d")
-    with worker_pool(jobs, done) as pool:
+    with worker_pool(jobs) as pool:
         futures = [pool.submit(_attempt, function, task) for task in tasks]
-        counted = 0.0
         for task, future in zip(tasks, futures, strict=True):
-            while not future.done():
-                wait([future], 0.2)
-                now = float(done.value)
-                progress(now - counted)
-                counted = now
             try:
                 answer = future.result()
             except BrokenProcessPool:
                 answer = InputError(f"{task.path}: the process was killed; is there enough memory? Try --jobs 1")
+            progress(1)
             yield task, answer
 
 
 @contextmanager
-def worker_pool(jobs: int, done: Any = None, context: BaseContext | None = None) -> Iterator[ProcessPoolExecutor]:
+def worker_pool(jobs: int, context: BaseContext | None = None) -> Iterator[ProcessPoolExecutor]:
     """A pool of processes that end with the context if it is left by an exception, and with this process.
 
-    done: a shared number, for functions that count their work. context: how they start.
+    context: how they start.
     """
     others = set(active_children())
-    with ProcessPoolExecutor(jobs, context, _begin, (done,)) as pool:
+    with ProcessPoolExecutor(jobs, context, _begin) as pool:
         try:
             yield pool
         except BaseException:  # Ctrl-C too, which reaches this process alone if it is sent to its number
@@ -137,13 +130,8 @@ def collect(
     return answers, failures
 
 
-_done: Any = None  # work done by all processes of the pool
-
-
-def _begin(done: Any) -> None:
+def _begin() -> None:
     """In each process of the pool: Ctrl-C ends it without a word, which the parent process reports; so does its end."""
-    global _done  # noqa: PLW0603 - the only way into a process of the pool
-    _done = done
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as a shell has it that started us in the background
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -155,15 +143,8 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _count(work: float) -> None:
-    with _done.get_lock():
-        _done.value += work
-
-
-def _attempt(
-    function: Callable[[TaskT, Progress], Answer], task: TaskT, progress: Progress = _count
-) -> Answer | InputError:
+def _attempt(function: Callable[[TaskT], Answer], task: TaskT) -> Answer | InputError:
     try:
-        return function(task, progress)
+        return function(task)
     except InputError as error:
         return error

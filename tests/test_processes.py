@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.processes import Task, over_rides
-from gz_onboard.progress import Progress
 from tests.support import HEARS_CTRL_C, ROOT
 
 LONG, ENOUGH = 600, 60  # s
 SCRIPT = "from tests.test_processes import main; main()"
 
 
-def work(task: Task, _: Progress) -> None:
+def work(task: Task) -> None:
     os.write(1, b"begun\n")  # in one piece, as two processes write
     time.sleep(LONG)
 

@@ -19,7 +19,7 @@ from gz_onboard.discovery.run import discover, known_rides
 from gz_onboard.errors import InputError, near_file, not_an_input, writing
 from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared
 from gz_onboard.processes import Task, over_rides
-from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.progress import progress_bar
 from gz_onboard.recording.logs import log_suffix, logs_among
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.reports.results import distinct_names, write_json
@@ -145,7 +145,7 @@ class _Reading(Task):
     effects: Path | None = None  # folder of the user's own
 
 
-def _read(task: _Reading, _: Progress) -> Recording:
+def _read(task: _Reading) -> Recording:
     samples = read_recording(task.path, read_vehicle(task.vehicle, effects_folder=task.effects))
     if task.payload is not None and samples.rider_mass is None:
         samples = replace(samples, facts={**samples.facts, "rider_mass_kg": task.payload})

@@ -21,7 +21,7 @@ from gz_onboard.can.logfile import LogFile
 from gz_onboard.can.recorder import is_complete
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import RideOptions, known_vehicle, open_estimate, run_ride, state_for, vehicle_of
-from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, held, latest, resume, saved_at, text_of, when
+from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, held, latest, saved_at, text_of, when
 from gz_onboard.estimation.summary import (
     SUMMARY_VERSION,
     TABLE_FORMATS,
@@ -36,7 +36,7 @@ from gz_onboard.estimation.summary import (
 from gz_onboard.imports import require
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.options import add_shared
-from gz_onboard.pipeline import Pipeline, dbc_texts, lacking
+from gz_onboard.pipeline import dbc_texts, lacking
 from gz_onboard.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.frames import SignalColumns
@@ -50,7 +50,6 @@ from gz_onboard.vehicle import find_vehicle
 
 _RECORD = "gz_onboard.estimate"  # of metadata, at the end of the log: the inputs of the estimates, and their summary
 _SUMMARY = "summary"
-_PICTURE_ENDS = (b"IEND\xaeB`\x82", b"</svg>\n", b"%%EOF\n")
 
 
 @dataclass(frozen=True)
@@ -159,8 +158,7 @@ def in_order(
     """Sort tasks by the times of their rides, each with the state `file` to continue from; and those not readable.
 
     Of an earlier run those results are kept that the state includes: of rides that ended before it was saved.
-    InputError naming the logs if two overlap or are of two vehicles, if one has no date, or if the first ride to be
-    estimated cannot continue from the state.
+    InputError naming the logs if two overlap or are of two vehicles, or if one has no date.
     """
     found: list[tuple[RideState, EstimateTask]] = []
     unread: list[tuple[EstimateTask, InputError]] = []
@@ -185,12 +183,7 @@ def in_order(
                 "a saved state goes from one ride to the next; give one of the two"
             )
     saved = _saved_ns(file)
-    ordered = [replace(task, state=at, resume=task.resume and at.end_ns <= saved) for at, task in found]
-    kept = [number for number, task in enumerate(ordered) if task.resume and _kept_summary(task)]
-    for task in ordered[max(kept, default=-1) + 1 :][:1]:
-        assert task.state
-        resume(Pipeline(open_estimate(task.path, vehicle_of(task)).vehicle), task.state, task.path)
-    return ordered, unread
+    return [replace(task, state=at, resume=task.resume and at.end_ns <= saved) for at, task in found], unread
 
 
 def _saved_ns(file: Path) -> float:
@@ -205,18 +198,10 @@ def _saved_ns(file: Path) -> float:
 # --- one log ------------------------------------------------------------------------------------------------------
 
 
-def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
-    """Estimate one log, write its MCAP and its picture, and return its summary. Raises InputError.
-
-    progress: called with 1 when it is done.
-    """
+def estimate_log(task: EstimateTask) -> RideSummary:
+    """Estimate one log, write its picture and its MCAP, and return its summary. Raises InputError."""
     kept = _kept_summary(task) if task.resume else None
-    summary = kept or _estimate(task)
-    if task.picture and not (kept and _is_drawn(task.picture, task.log)):
-        _draw(task.log, summary, task.picture)
-    if progress:
-        progress(1)
-    return summary
+    return kept or _estimate(task)
 
 
 def _estimate(task: EstimateTask) -> RideSummary:
@@ -245,7 +230,9 @@ def _estimate(task: EstimateTask) -> RideSummary:
             summary = summary_of(found, task.log, task.picture)
             log.note(_RECORD, {**_inputs(task), _SUMMARY: encode_summary(summary)})
             log.close()
-            task.part.replace(task.log)
+            if task.picture:
+                _draw(task.part, summary, task.picture)
+            task.part.replace(task.log)  # last: a log that is there has its picture
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
@@ -292,21 +279,12 @@ _digest_once = functools.lru_cache(maxsize=None)(digest_of)  # of the files that
 
 
 def _kept_summary(task: EstimateTask) -> RideSummary | None:
-    """Return the summary in the log that an earlier run wrote, if the log is complete and had the same inputs."""
+    """Return the summary of an earlier run, if its log and its picture are complete and had the same inputs."""
     try:
-        if not is_complete(task.log):
+        if not is_complete(task.log) or (task.picture and not task.picture.exists()):
             return None
         found = read_metadata(task.log, _RECORD)
     except (OSError, InputError):
         return None
     text = found.pop(_SUMMARY, "")
     return decode_summary(text, task.path, task.log, task.picture) if found == _inputs(task) else None
-
-
-def _is_drawn(picture: Path, log: Path) -> bool:
-    """Return whether a picture is complete, and not older than its log."""
-    try:
-        with picture.open("rb") as stream:
-            return stream.read().endswith(_PICTURE_ENDS) and picture.stat().st_mtime_ns >= log.stat().st_mtime_ns
-    except OSError:
-        return False

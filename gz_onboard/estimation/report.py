@@ -23,7 +23,7 @@ from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.options import add_shared
 from gz_onboard.processes import Task, collect, over_rides
 from gz_onboard.progress import Progress, progress_bar
-from gz_onboard.recording.logs import distinct_logs
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable
 from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance
@@ -111,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard report``: `OK` if every log is in the page, else `BAD_INPUT`."""
-    logs = distinct_logs(arguments.logs)
+    logs = logs_among(arguments.logs)
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     check_page(out)
@@ -137,12 +137,9 @@ def check_page(out: Path) -> None:
         raise InputError(f"{out}: cannot be written: there is no folder {out.parent}; make it")
 
 
-def _section_of_log(task: ReportTask, progress: Progress | None = None) -> RideSection:
+def _section_of_log(task: ReportTask) -> RideSection:
     """The section of the page for one log. Raises InputError."""
-    made = section_of(report_of(task.path, vehicle_of(task), task.route, task.located), task.stem.name)
-    if progress:
-        progress(1)
-    return made
+    return section_of(report_of(task.path, vehicle_of(task), task.route, task.located), task.stem.name)
 
 
 # --- the ride -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import logging
 import mmap
 import re
 import zlib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -188,7 +188,9 @@ def _by_content(head: bytes, time: str = "") -> str | None:
 
 
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
-    """`paths`, with the logs in a folder and its subfolders in place of it, by name. InputError for one without any.
+    """Return `paths`, with the logs of a folder and its subfolders in place of the folder, by name, each log once.
+
+    InputError for a folder without any.
 
     CSV and text files of a folder are skipped, as they are mostly something else, and so is what ``gz-onboard
     estimate`` wrote. estimates: take that in place of the logs that it is of; None: take both.
@@ -212,7 +214,7 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
             raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
-    return logs
+    return list(dict.fromkeys(logs))
 
 
 def digest_of(file: Path) -> str:
@@ -222,22 +224,6 @@ def digest_of(file: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise unreadable(file, error) from None
-
-
-def distinct_logs(paths: Iterable[Path]) -> list[Path]:
-    """Return the logs of `logs_among`, each content once, with a warning for each that is left out."""
-    logs = logs_among(paths)
-    sizes = Counter(log.stat().st_size for log in dict.fromkeys(logs) if log.is_file())
-    first: dict[object, Path] = {}
-    for log in logs:
-        again = log.is_file() and sizes[log.stat().st_size] > 1
-        which = digest_of(log) if again else log
-        if (kept := first.get(which)) is None:
-            first[which] = log
-        else:
-            said = "is given twice" if kept == log else f"is the same log as {kept}"
-            _LOG.warning("%s: %s; it counts once", log, said)
-    return list(first.values())
 
 
 def log_stem(log: Path) -> str:

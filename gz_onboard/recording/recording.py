@@ -65,18 +65,14 @@ class Recording:
         return rider_mass(self.facts)
 
 
-def read_recording(
-    source: Path | SignalTable, vehicle: Vehicle, progress: Callable[[int], None] | None = None
-) -> Recording:
+def read_recording(source: Path | SignalTable, vehicle: Vehicle) -> Recording:
     """Read the ride of `vehicle` in a log or a table, with what a ``rides.json`` next to the log says about it.
 
-    progress: called with the number of frames. InputError for a log that cannot be read or is not of the vehicle.
+    InputError for a log that cannot be read or is not of the vehicle.
     """
     mapping, frames = open_ride(source, vehicle)
     file = source.name if isinstance(source, SignalTable) else source
     columns = read_roles(file, vehicle, Codec(extended(mapping), LONGEST_PAUSE_NS), frames)
-    if progress:
-        progress(len(frames))
     return Recording(ride_name(file), columns, {} if isinstance(source, SignalTable) else facts_of(source))
 
 

@@ -6,7 +6,6 @@ filter (accelerometer, altitude, yaw rate), or that of a route file. Its roughne
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import nan, pi
 from pathlib import Path
@@ -109,14 +108,11 @@ class Recorded:
         return road_table(starts, self.grade.tolist(), self.curvature.tolist(), headwind)
 
 
-def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Recorded:
-    """The ride in `log`, of `vehicle`. progress: called with the number of frames read.
-
-    Raises InputError for a log that cannot be read, or that has no speed.
-    """
+def read_recorded(log: Path, vehicle: Vehicle) -> Recorded:
+    """The ride in `log`, of `vehicle`. InputError for a log that cannot be read, or that has no speed."""
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
-    columns = true_columns(read_recording(log, vehicle, progress).columns, vehicle.parameters)
+    columns = true_columns(read_recording(log, vehicle).columns, vehicle.parameters)
     rows: list[tuple[float, ...]] = []
     reads_vibration = "vibration" in vehicle.model.reads and "accel_z" in columns
 

@@ -18,7 +18,7 @@ from gz_onboard.progress import progress_bar
 from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.reports.results import descriptions, write_json
 from gz_onboard.validation.comparison import SimulationVerdict, ValidatedRide, pool
-from gz_onboard.validation.ride import PICTURE, log_size, validate_ride
+from gz_onboard.validation.ride import PICTURE, validate_ride
 from gz_onboard.validation.tables import markdown, ride_text, write_report
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors concern every log
     with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
-    with progress_bar(lambda: sum(log_size(task.path) for task in tasks), quiet=arguments.quiet) as display:
+    with progress_bar(lambda: len(tasks), "rides", quiet=arguments.quiet) as display:
         results = over_rides(validate_ride, tasks, arguments.jobs, display.update)
         rides, failed = collect("validate", results, display, None if arguments.json == "-" else ride_text)
     together = pool(rides)

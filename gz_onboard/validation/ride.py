@@ -20,7 +20,6 @@ from gz_onboard.estimator.battery_priors import VoltageNoise
 from gz_onboard.model.battery import discharged
 from gz_onboard.model.series import curve_over
 from gz_onboard.processes import Task
-from gz_onboard.progress import Progress
 from gz_onboard.recording.recording import facts_of, ride_name, rider_mass
 from gz_onboard.simulation.parts import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.plan import ridden_road, route_file
@@ -44,8 +43,6 @@ from gz_onboard.validation.components import components, losses
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 PICTURE = ".validation"
-FRAME_BYTES = 13.0  # of a compressed log
-_READING = 0.4  # share of the work
 
 
 @dataclass(frozen=True)
@@ -76,8 +73,8 @@ class MeasuredRide:
         mean = float(current.mean())
         return float(self.seconds["pack_power"].mean()), float(np.mean(current**2)) / mean**2 if mean else 1.0
 
-    def simulate(self, command: Command, progress: Progress) -> Run:
-        """Ride from the measured start; progress: takes simulated seconds."""
+    def simulate(self, command: Command) -> Run:
+        """Ride from the measured start."""
         here: Place = (0.0, 0.0, 0.0)
         step, road, signals = 0, self.road, self.recorded.signals
         distance = signals["distance"].tolist()
@@ -97,18 +94,13 @@ class MeasuredRide:
             soc=0.5 if self.soc is None else self.soc,
             vibration=(lambda _: rough[step]) if rough else None,
         )
-        return drive(scooter, at_measured_place, self.recorded.duration, progress=progress)
+        return drive(scooter, at_measured_place, self.recorded.duration)
 
 
-def log_size(log: Path) -> int:
-    """Size of a log [bytes], as a measure of the work."""
-    return log.stat().st_size if log.is_file() else 1
-
-
-def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedRide:
-    """Compare one ride with its simulation, and draw it; `progress` counts bytes of the log. Raises InputError."""
+def validate_ride(task: Task) -> ValidatedRide:
+    """Compare one ride with its simulation, and draw it. Raises InputError."""
     payload = task.payload if task.payload is not None else rider_mass(facts_of(task.path))
-    compared = compare_ride(task.path, read_vehicle(task.vehicle, payload), progress)
+    compared = compare_ride(task.path, read_vehicle(task.vehicle, payload))
     picture = task.drawn(PICTURE)
     if not picture:
         return compared.result
@@ -120,17 +112,15 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedR
     return result
 
 
-def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: None) -> ComparedRide:
+def compare_ride(log: Path, vehicle: Vehicle) -> ComparedRide:
     """Compare one ride of `vehicle`, payload included, with its simulation. Raises InputError."""
-    size = log_size(log)
-    ride = measure(log, vehicle, _at_most(FRAME_BYTES, _READING * size, progress))
+    ride = measure(log, vehicle)
     recorded, measured = ride.recorded, ride.seconds
     commands = _commands(ride)
-    per_second_ridden = (1 - _READING) * size / len(commands) / recorded.duration
     comparisons: dict[str, dict[str, Comparison]] = {}
     ends: dict[str, PackEmpty | None] = {}
     for form, command in commands.items():
-        run = ride.simulate(command, lambda seconds: progress(per_second_ridden * seconds))
+        run = ride.simulate(command)
         comparisons[form] = _compare(measured, run, {"throttle"} if form == "open_loop" else set())
         ends[form] = _pack_empty(ride, run)
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
@@ -178,22 +168,9 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
 # --- measurements -------------------------------------------------------------------------------------------------
 
 
-def _at_most(worth: float, most: float, progress: Progress) -> Progress:
-    """Count each unit of work as `worth`, up to `most` in all."""
-    left = most
-
-    def count(units: float) -> None:
-        nonlocal left
-        part = min(worth * units, left)
-        left -= part
-        progress(part)
-
-    return count
-
-
-def measure(log: Path, vehicle: Vehicle, progress: Progress = lambda _: None) -> MeasuredRide:
-    """Read a ride that is long enough to judge; progress: takes frames. Raises InputError."""
-    recorded = read_recorded(log, vehicle, progress)
+def measure(log: Path, vehicle: Vehicle) -> MeasuredRide:
+    """Read a ride that is long enough to judge. Raises InputError."""
+    recorded = read_recorded(log, vehicle)
     seconds = per_second(recorded) | losses_per_second(recorded, vehicle)
     length = len(seconds["speed"])
     if length < CONFIG.shortest_s:

@@ -10,7 +10,7 @@ from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input
 from gz_onboard.options import LOG_SUFFIXES, add_shared
 from gz_onboard.priors import correlations
 from gz_onboard.progress import progress_bar
-from gz_onboard.recording.logs import distinct_logs
+from gz_onboard.recording.logs import logs_among
 from gz_onboard.reports.results import Failure, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 from gz_onboard.vehicle_check import new
@@ -46,7 +46,7 @@ def check_vehicle(arguments: argparse.Namespace) -> int:
         raise InputError(f"{given}: is a folder; the vehicle comes first, by name or file, then its logs")
     vehicle = read_vehicle(arguments.vehicle)
     correlations(vehicle)
-    logs = distinct_logs(arguments.logs)
+    logs = logs_among(arguments.logs)
     not_an_input([arguments.json], [*logs, find_vehicle(arguments.vehicle)])
     print_text = arguments.json != "-"
     if not logs and print_text:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import gz_onboard as gz
 from gz_onboard.cli import main
 from gz_onboard.estimation.report import changed_by, path_of
 from gz_onboard.estimation.summary import Why
 from gz_onboard.estimator.load_model import Ledger
-from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.recording import Recording
-from tests.support import LOGS, write_log
+from tests.support import LOGS
 
 
 def test_a_sensor_left_out_takes_with_it_what_it_taught():
@@ -43,7 +40,12 @@ def test_the_path_has_holes_where_there_is_no_fix():
 def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("none.log").write_text("noise\n" * 100)
-    rides = [str(LOGS / "coastdown.blf"), "none.log", str(LOGS / "calibration" / "coastdown_02.blf")]
+    rides = [
+        str(LOGS / "coastdown.blf"),
+        str(LOGS / "coastdown.blf"),
+        "none.log",
+        str(LOGS / "calibration" / "coastdown_02.blf"),
+    ]
     assert main(["report", *rides, "--jobs", "1", "--quiet"]) == 2
     said = capsys.readouterr()
     assert said.out == "rides.html\n"
@@ -59,20 +61,6 @@ def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(t
     assert main(["report", rides[0], "--quiet"]) == 0
     section = re.findall(r"<section.*?</section>", Path("coastdown.html").read_text(), re.DOTALL)
     assert section[0] in text  # the same log, the same bytes
-
-
-def test_a_log_of_several_names_is_one_ride_and_a_warning_says_so(tmp_path, monkeypatch, caplog, capsys):
-    monkeypatch.chdir(tmp_path)
-    frames = next(read_frames(LOGS / "coastdown.blf"))
-    for name, part in (("one.log", frames[:-1]), ("other.log", frames[1:])):
-        write_log(Path(name), part)
-    shutil.copy("one.log", "copy.log")
-    given = ["one.log", "one.log", "copy.log", "other.log"]
-    said = ["one.log: is given twice; it counts once", "copy.log: is the same log as one.log; it counts once"]
-    assert main(["report", *given, "--quiet", "--jobs", "1"]) == 0
-    assert "<h1>2 rides</h1>" in Path("rides.html").read_text()
-    assert caplog.messages == said
-    assert [ride.name for ride in gz.report(given).rides] == ["one", "other"]
 
 
 @pytest.mark.parametrize("lines", [2, 400])
