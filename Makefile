@@ -76,5 +76,5 @@ mutants: setup  ## 300 wrong lines, one at a time: do the tests notice each?
 	$(PYTHON_IN_VENV) -m tests.mutants
 
 clean:  ## remove what the other targets made, except runs/
-	rm -rf .venv build dist docs/api docs/generated tests/display/foxglove_npm/node_modules .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf .venv build dist docs/api docs/generated .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

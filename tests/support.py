@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from math import isfinite, log
@@ -37,6 +38,15 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def wait_for(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
+    """What `condition` gives as soon as that is true; fails with `what` after `seconds`."""
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end, f"not within {seconds:g} s: {what}"
+        time.sleep(0.02)
+    return found
 
 
 def cell_voltage(battery: Battery, soc: float, v1: float, current: float, temperature: float) -> float:

@@ -9,9 +9,8 @@ from math import sin
 from gz_onboard.events import Activity, Estimate
 from tests.browser.support import opened_browser, shows
 from tests.browser.test_page import UNREACHABLE
-from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
+from tests.display.served import ESTIMATE, Sender, cells, dashboard, odometer, vehicle_frames
 from tests.display.test_picture import CHARGING, HEALTHY, ON_ROUTE
-from tests.display.test_terminal import ESTIMATE
 from tests.support import ROOT
 
 COLOURS = 48  # the pictures have few

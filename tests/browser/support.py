@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tests.support import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page
@@ -38,15 +39,6 @@ def opened_browser() -> Iterator[BrowserContext]:
         context.set_default_timeout(LONG * 1000)
         yield context
         context.close()
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """What `condition` gives as soon as that is something; fails after `LONG`."""
-    end = time.monotonic() + LONG
-    while not (found := condition()):
-        assert time.monotonic() < end, f"not within {LONG:g} s: {what}"
-        time.sleep(0.05)
-    return found
 
 
 TEXTS = """() => Object.fromEntries([...document.querySelectorAll("[id]")].map(

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from gz_onboard.events import Reason, State
-from tests.browser.support import plain, shows, texts, wait_for
+from tests.browser.support import plain, shows, texts
 from tests.browser.test_page import UNREACHABLE
-from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
+from tests.display.served import ESTIMATE, Sender, cells, dashboard, odometer, vehicle_frames
 from tests.display.test_picture import CHARGING, HEALTHY
-from tests.display.test_terminal import ESTIMATE
+from tests.support import wait_for
 
 SIZES = [(320, 240), (480, 320), (390, 844), (800, 480), (1280, 800)]
 

@@ -10,10 +10,10 @@ import pytest
 
 from gz_onboard.display.server import Feed, served
 from gz_onboard.events import Reason, State
-from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
-from tests.display.served import Sender, cells, dashboard, odometer, vehicle_frames
+from tests.browser.support import alerts, numbers, plain, shows, texts
+from tests.display.served import ESTIMATE, Sender, cells, dashboard, odometer, vehicle_frames
 from tests.display.test_picture import HEALTHY, ON_ROUTE
-from tests.display.test_terminal import ESTIMATE
+from tests.support import wait_for
 
 UNREACHABLE = replace(
     ON_ROUTE,

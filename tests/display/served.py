@@ -5,22 +5,69 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from types import ModuleType
 
+import pytest
+
+from gz_onboard import cli
 from gz_onboard.can._can import can
 from gz_onboard.can.channel import CanChannel
 from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.can.layout import crc8_sae_j1850
-from gz_onboard.can.publisher import Publisher
+from gz_onboard.can.publisher import Counts, Publisher
+from gz_onboard.display import command
 from gz_onboard.display.command import pictures
 from gz_onboard.display.server import Feed, served
 from gz_onboard.display.vehicle_frames import VehicleFrames
 from gz_onboard.display.view import TREND_STEP, View, encoded
-from gz_onboard.events import Estimate, Frame
+from gz_onboard.events import Activity, Cause, Estimate, Explanation, Frame, Reason, State
 from gz_onboard.vehicle import read_vehicle
-from tests.display.test_terminal import COUNTS, ESTIMATE, send
+
+REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
+
+ESTIMATE = Estimate(
+    time=1.0,
+    activity=Activity.RIDING,
+    state=State.DEGRADED,
+    reasons=REASONS,
+    soc=0.624,
+    soc_sd=0.012,
+    range=34_210.0,
+    range_p10=26_540.0,
+    range_p90=44_340.0,
+    energy_left=895 * 3600.0,
+    consumption_recent=24.6 * 3.6,
+    consumption_expected=26.2 * 3.6,
+    why=Explanation(
+        1.0, 57_600.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
+    ),
+)
+
+COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
+
+
+def second(publisher: Publisher, estimate: Estimate = ESTIMATE) -> list[Frame]:
+    """What the daemon sends in a second."""
+    frames = publisher.range(estimate, COUNTS, 0)
+    for _ in range(10):
+        frames += publisher.status(estimate, 0)
+    return frames
+
+
+def seen(estimate: Estimate = ESTIMATE, now: float = 100.0) -> View:
+    view = View()
+    for frame in second(Publisher(), estimate):
+        view.take(frame, now)
+    return view
+
+
+def send(bus: can.BusABC, frames: Iterable[Frame]) -> None:
+    for _, identifier, data, _ in frames:
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
 
 VEHICLE = load_database([find_dbc("vehicle.dbc")])
 
@@ -53,6 +100,23 @@ def dashboard(
             stop.set()
             loop.join()
             bus.close()
+
+
+@contextmanager
+def command_running(monkeypatch: pytest.MonkeyPatch, module: ModuleType, *arguments: str) -> Iterator[list[str]]:
+    """The command of a module of `gz_onboard.display` on the virtual bus, in a thread; gives what it reports."""
+    said: list[str] = []
+    stop = threading.Event()
+    monkeypatch.setattr(command, "until_signalled", lambda duration: nullcontext(stop.is_set))
+    monkeypatch.setattr(module, "report", lambda _, text: said.append(text))
+    words = [module.__name__.rpartition(".")[2], *arguments, "--interface", "virtual"]
+    thread = threading.Thread(target=cli.main, args=(words,))
+    thread.start()
+    try:
+        yield said
+    finally:
+        stop.set()
+        thread.join()
 
 
 Own = tuple[str, dict[str, float]]

@@ -1,77 +1,73 @@
-"""The live estimate and position, as clients of Foxglove's protocol get them: one written by hand, and its own."""
+"""The live estimate and position, as a client of Foxglove's protocol gets them."""
 
 from __future__ import annotations
 
 import json
-import math
 import struct
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain, takewhile
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
-from gz_onboard import cli
 from gz_onboard.can._can import can
-from gz_onboard.display import command as dashboard
 from gz_onboard.display import foxglove as command
 from gz_onboard.display.vehicle_frames import VehicleFrames
-from gz_onboard.events import EFF_FLAG, Frame
+from gz_onboard.events import Frame
 from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
-from tests.display import foxglove_clients
-from tests.display.broker import wait_for
-from tests.display.foxglove_clients import CLIENTS, documented
-from tests.display.served import Sender
-from tests.display.test_terminal import ESTIMATE, send
-from tests.support import LOGS
+from tests.display.served import ESTIMATE, Sender, command_running, send
+from tests.support import LOGS, wait_for
 
 SECONDS = 5
+PATIENCE = 60.0  # s
+FIRST = 7  # subscription
+DATA = struct.Struct("<BIQ")  # operation, subscription, log time
 GPS_MOTION = 1073
-TRUCK_DBC = """VERSION ""
-BO_ 2566845438 VP: 8 Vector__XXX
- SG_ Latitude : 0|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
- SG_ Longitude : 32|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
-"""
-TRUCK = """schema = 1
-name = "truck"
-dbc = ["truck.dbc"]
-[bus]
-identifiers = "j1939"
-[roles]
-{roles}
-"""
+
+
+class Message(NamedTuple):
+    topic: str
+    time_ns: int
+    row: dict[str, Any]
+
+
+@contextmanager
+def client(address: str, *topics: str) -> Iterator[tuple[dict[str, dict[str, Any]], Iterator[Message]]]:
+    """A client by Foxglove's documented protocol: the channels advertised, by topic, and the messages of `topics`."""
+    with connect(address, subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
+
+        def messages() -> Iterator[Message]:
+            while True:
+                data = socket.recv(PATIENCE)
+                if isinstance(data, bytes):
+                    operation, subscription, time_ns = DATA.unpack_from(data)
+                    assert operation == 1
+                    yield Message(topics[subscription - FIRST], time_ns, json.loads(data[DATA.size :]))
+
+        there: dict[str, dict[str, Any]] = {}
+        while not there.keys() >= set(topics):
+            told = json.loads(socket.recv(PATIENCE))
+            if told["op"] == "advertise":
+                there |= {channel["topic"]: channel for channel in told["channels"]}
+        wanted = [{"id": FIRST + n, "channelId": there[topic]["id"]} for n, topic in enumerate(topics)]
+        socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        yield there, messages()
 
 
 @contextmanager
 def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Iterator[str]:
     """Its address."""
-    said: list[str] = []
-    stop = threading.Event()
-
-    @contextmanager
-    def stopped(duration: float | None = None) -> Iterator[Any]:
-        end = time.monotonic() + (duration or math.inf)
-        yield lambda: stop.is_set() or time.monotonic() >= end
-
-    monkeypatch.setattr(dashboard, "until_signalled", stopped)
-    monkeypatch.setattr(command, "report", lambda _, text: said.append(text))
-    arguments = ["foxglove", "--interface", "virtual", "--channel", channel, "--listen", "127.0.0.1:0"]
-    thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
-    thread.start()
-    try:
-        wait_for(lambda: bool(said), "it serves")
+    arguments = ["--channel", channel, "--listen", "127.0.0.1:0", *options]
+    with command_running(monkeypatch, command, *arguments) as said:
+        wait_for(lambda: said, "it serves")
         yield said[0].split()[0]
-    finally:
-        stop.set()
-        thread.join()
 
 
 class Kept:
@@ -91,8 +87,7 @@ class Kept:
         self.rows.setdefault(topic, []).append(values)
 
 
-@pytest.mark.parametrize("client", CLIENTS)
-def test_the_estimate_is_that_of_the_log_and_nothing_old(client, monkeypatch):
+def test_the_estimate_is_that_of_the_log_and_nothing_old(monkeypatch):
     logged = Kept()
     declare(logged, ())
     with serving("f1", monkeypatch) as address, client(address, "/estimate") as (channels, heard):
@@ -124,17 +119,6 @@ def test_the_estimate_is_that_of_the_log_and_nothing_old(client, monkeypatch):
         gone = next(one.row for one in heard if one.row["soc"] is None)  # the status is stale after a second
         assert gone["soc_sd"] is None
         assert gone["state"] == "UNKNOWN"
-
-
-def test_the_subprotocol_before_the_sdk_is_refused(monkeypatch):
-    """As the documentation says: the reason why the library's own constant is not offered."""
-    monkeypatch.setattr(foxglove_clients, "SUBPROTOCOL", "foxglove.websocket.v1")
-    with (
-        serving("f4", monkeypatch) as address,
-        pytest.raises(InvalidStatus, match="HTTP 400"),
-        documented(address, "/estimate"),
-    ):
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -185,20 +169,7 @@ def test_what_a_fix_tells(ridden, fix, told):
     assert {"altitude" in row for row in rows} <= {told}
 
 
-def test_positions_of_a_truck_whoever_sends_them(tmp_path):
-    """J1939: the source address is not in the DBC file, so the kernel cannot let through the position alone."""
-    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
-    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"\nlongitude = "Longitude"'))
-    positions = VehicleFrames(read_vehicle(tmp_path / "truck.toml"), positions=True)
-    assert positions.identifiers is None
-    place = struct.pack("<II", round((48.1 + 210) * 1e7), round((11.6 + 210) * 1e7))
-    frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
-    (row,) = positions_of(positions, frames).values()
-    assert (row["latitude"], row["longitude"]) == pytest.approx((48.1, 11.6))
-
-
-@pytest.mark.parametrize("client", CLIENTS)
-def test_positions_live(client, monkeypatch, ridden):
+def test_positions_live(monkeypatch, ridden):
     vehicle = read_vehicle("reference")
     identifiers = VehicleFrames(vehicle, positions=True).identifiers or []
     mine = [frame for frame in ridden if frame[1] in identifiers]

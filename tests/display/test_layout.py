@@ -12,9 +12,8 @@ from mcap.reader import make_reader
 
 from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.events import Frame
-from gz_onboard.log_rows import LOCATION_SCHEMA
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.logs import read_frames, read_samples
+from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 
@@ -51,25 +50,6 @@ def messages(log: Path) -> dict[str, list[dict[str, Any]]]:
             if channel.message_encoding == "json":
                 found.setdefault(channel.topic, []).append(json.loads(message.data))
     return found
-
-
-def test_positions_are_fixes_that_foxglove_knows(log):
-    found = messages(log)["/location"]
-    assert SECONDS * 0.9 <= len(found) <= SECONDS + 1
-    stamps = [(one["timestamp"]["sec"], one["timestamp"]["nsec"]) for one in found]
-    assert stamps == sorted(set(stamps))
-    recorded = [values for topic, _, values in read_samples(log) if topic == "/can/GPS_Position"]
-    there = {(round(values["GPS_Latitude"], 5), round(values["GPS_Longitude"], 5)) for values in recorded}
-    for one in found:
-        assert one.keys() <= LOCATION_SCHEMA["properties"].keys()
-        assert set(LOCATION_SCHEMA["required"]) <= one.keys()
-        assert (round(one["latitude"], 5), round(one["longitude"], 5)) in there
-    assert any("altitude" in one for one in found)
-    with log.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    schemas = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
-    assert {schemas["/location"], schemas["/battery_ends"]} == {"foxglove.LocationFix"}
 
 
 def test_signals_have_the_time_at_which_they_were_seen(log):

@@ -3,62 +3,34 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any
 
 import jinja2
 import pytest
 
-from gz_onboard import cli
-from gz_onboard.display import command as dashboard
 from gz_onboard.display import mqtt
 from gz_onboard.display.view import View
 from gz_onboard.events import Activity, State
-from tests.display.broker import Listener, broker, free_port, listening, wait_for
-from tests.display.served import Sender
-from tests.display.test_terminal import ESTIMATE
+from tests.display.broker import Listener, broker, free_port, listening
+from tests.display.served import ESTIMATE, Sender, command_running
+from tests.support import wait_for
 
 STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
 NUMBERS = [key for key, (_, about) in mqtt.SENSORS.items() if "unit_of_measurement" in about]
 
 
-@contextmanager
-def bridge(port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """The command in a thread; gives what it says."""
-    said: list[str] = []
-    stop = threading.Event()
-
-    @contextmanager
-    def stopped(duration: float | None = None) -> Iterator[Any]:
-        end = time.monotonic() + (duration or math.inf)
-        yield lambda: stop.is_set() or time.monotonic() >= end
-
-    monkeypatch.setattr(dashboard, "until_signalled", stopped)
-    monkeypatch.setattr(mqtt, "report", lambda _, text: said.append(text))
-    arguments = ["mqtt", f"127.0.0.1:{port}", "--interface", "virtual", "--channel", channel, "--name", "scooter"]
-    thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
-    thread.start()
-    try:
-        yield said
-    finally:
-        stop.set()
-        thread.join()
-
-
-@contextmanager
-def sending(channel: str, **changes: Any) -> Iterator[Sender]:
-    with Sender(channel, replace(ESTIMATE, **changes)) as sender:
-        yield sender
+def bridge(
+    port: int, channel: str, *options: str, monkeypatch: pytest.MonkeyPatch
+) -> AbstractContextManager[list[str]]:
+    return command_running(monkeypatch, mqtt, f"127.0.0.1:{port}", "--channel", channel, "--name", "scooter", *options)
 
 
 def shown(about: dict[str, Any], state: dict[str, Any]) -> dict[str, str]:
@@ -83,7 +55,7 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
     with broker(tmp_path, port), listening(port) as listener, bridge(port, "m1", monkeypatch=monkeypatch) as said:
         wait_for(lambda: STATE in listener.last, "a state")
         assert seen(listener) == {"alert": "silent"}
-        with sending("m1") as sender:
+        with Sender("m1", ESTIMATE) as sender:
             wait_for(lambda: {"range", "state_of_charge", "energy_left"} <= seen(listener).keys(), "the range")
             found = seen(listener)
             assert float(found["range"]) == 34.21

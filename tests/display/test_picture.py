@@ -15,7 +15,7 @@ from gz_onboard.can.publisher import Publisher, sensor_signal
 from gz_onboard.display.server import STATIC
 from gz_onboard.display.view import ALERTS, NEARLY_EMPTY, NO_LONGER_EMPTY, NO_NEWS, Picture, View, encoded
 from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
-from tests.display.test_terminal import COUNTS, ESTIMATE, second, seen
+from tests.display.served import COUNTS, ESTIMATE, second, seen
 
 BUS = "vcan0", "socketcan", True
 HEALTHY = replace(ESTIMATE, state=State.VALID, reasons=Reason(0))

@@ -20,47 +20,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard import cli
-from gz_onboard.can._can import can
-from gz_onboard.can.dbc import find_dbc
-from gz_onboard.can.publisher import Counts, Publisher
+from gz_onboard.can.publisher import Publisher
 from gz_onboard.display import terminal
 from gz_onboard.display.view import Picture, View
-from gz_onboard.events import NO_SENSOR, ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State
-
-REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
-ESTIMATE = Estimate(
-    time=1.0,
-    activity=Activity.RIDING,
-    state=State.DEGRADED,
-    reasons=REASONS,
-    soc=0.624,
-    soc_sd=0.012,
-    range=34_210.0,
-    range_p10=26_540.0,
-    range_p90=44_340.0,
-    energy_left=895 * 3600.0,
-    consumption_recent=24.6 * 3.6,
-    consumption_expected=26.2 * 3.6,
-    why=Explanation(
-        1.0, 57_600.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
-    ),
-)
-COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
-
-
-def second(publisher: Publisher, estimate: Estimate = ESTIMATE) -> list[Frame]:
-    """What the daemon sends in a second."""
-    frames = publisher.range(estimate, COUNTS, 0)
-    for _ in range(10):
-        frames += publisher.status(estimate, 0)
-    return frames
-
-
-def seen(estimate: Estimate = ESTIMATE, now: float = 100.0) -> View:
-    view = View()
-    for frame in second(Publisher(), estimate):
-        view.take(frame, now)
-    return view
+from gz_onboard.events import NO_SENSOR, ROLES, Estimate, Reason, State
+from tests.display.served import COUNTS, ESTIMATE, Sender, seen
 
 
 def at(view: View, now: float) -> Picture:
@@ -70,11 +34,6 @@ def at(view: View, now: float) -> Picture:
 def drawn(view: View, now: float, width: int = 80, *, colour: bool = False) -> str:
     lines = terminal.screen(at(view, now), width, view.comments)
     return "\n".join(terminal.rendered(line, width, colour) for line in lines)
-
-
-def numbers(text: str) -> list[str]:
-    """The quantities in a picture; that the interval is one of 80 % is none."""
-    return re.findall(r"\d (?:km|Wh|%)", text.replace("80 %: ", ""))
 
 
 def test_it_shows_what_the_daemon_sends():
@@ -106,20 +65,6 @@ def test_a_scooter_that_is_not_on_is_waited_for():
     assert not re.search("no IMU|Because|invalid", text)
 
 
-def test_an_old_number_is_never_shown_as_if_fresh():
-    view = seen(now=100.0)
-    assert "62.4" in drawn(view, 100.9)
-    after = drawn(view, 101.1)  # ten periods of RANGE_Status
-    assert "62.4" not in after
-    assert re.search(r"Stale +RANGE_Status\n", after)
-    assert "34.2 km" in after
-    for late in 110.1, 1e4, 1e9:
-        text = drawn(view, late)
-        assert not numbers(text)
-        assert "unknown" in text
-        assert all(f" {name}\n" in text for name in view.messages)
-
-
 @pytest.mark.parametrize("heard", [False, True])
 def test_before_the_first_range_it_is_starting(heard):
     """The status is sent ten times as often as the range, which has not come, or still says that there is none."""
@@ -140,17 +85,6 @@ def test_before_the_first_range_it_is_starting(heard):
     assert "expected, – over the last km" in text  # the last kilometre was ridden who knows when
 
 
-@pytest.mark.parametrize("activity", Activity)
-def test_what_the_vehicle_does(activity):
-    view = seen(replace(ESTIMATE, activity=activity))
-    text = drawn(view, 100.0)
-    if activity is Activity.UNKNOWN:
-        assert "Activity" not in text
-    else:
-        assert f"Activity          {activity.name.lower()}\n" in text
-    assert "Activity" not in drawn(view, 1e4)
-
-
 def test_sensors_left_out_are_named():
     reasons = Reason.SENSOR_DISTRUSTED | Reason.SIGNALS_SLOW | Reason.SOC_RESTARTED | Reason.SAVE_FAILED
     view = seen(replace(ESTIMATE, reasons=reasons, distrusted=("accel_x", "gps_altitude", "bms_state_of_charge")))
@@ -162,27 +96,6 @@ def test_sensors_left_out_are_named():
 
 
 # --- range frames of another file ---------------------------------------------------------------------------------
-
-
-VAN = replace(
-    ESTIMATE,
-    range=412e3,
-    range_p10=365e3,
-    range_p90=466e3,
-    energy_left=54_500 * 3600.0,
-    consumption_recent=718 * 3.6,
-    consumption_expected=132 * 3.6,
-)
-
-
-def test_large_frames_by_their_own_file():
-    file = find_dbc("range_large.dbc")
-    view = View(Publisher(file))
-    for frame in second(Publisher(file), VAN):
-        view.take(frame, 100.0)
-    text = drawn(view, 100.0)
-    for shown in "412.0 km", "365.0 km to 466.0 km", "54500 Wh", "132.0 Wh/km expected", "718.0 Wh/km over":
-        assert shown in text
 
 
 def test_a_broken_frame_is_counted_and_not_shown():
@@ -242,34 +155,9 @@ def test_every_line_fits(soc, sd, metres, width):
 # --- the command, on python-can's in-process bus ------------------------------------------------------------------
 
 
-@pytest.fixture
-def sender():
-    with can.Bus(interface="virtual", channel="dashboard", preserve_timestamps=False) as bus:
-        yield bus
-
-
-def send(bus, frames):
-    for _, identifier, data, _ in frames:
-        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-
-
 def test_once(capsys):
-    import threading
-
-    def sending():
-        publisher = Publisher()
-        with can.Bus(interface="virtual", channel="once") as bus:
-            while not stop.wait(0.05):
-                send(bus, second(publisher))
-
-    stop = threading.Event()
-    thread = threading.Thread(target=sending)
-    thread.start()
-    try:
+    with Sender("once", ESTIMATE):
         status = cli.main(["dashboard", "--interface", "virtual", "--channel", "once", "--once"])
-    finally:
-        stop.set()
-        thread.join()
     text = capsys.readouterr().out
     assert status == 0
     assert "34.2 km" in text
@@ -301,7 +189,7 @@ CHILD = """
 import sys, threading, time
 from gz_onboard import cli
 from gz_onboard.can._can import can
-from tests.display.test_terminal import second, send
+from tests.display.served import second, send
 from gz_onboard.can.publisher import Publisher
 
 def sending():

@@ -20,9 +20,8 @@ from gz_onboard.events import Estimate
 from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.model.tables import Derating
 from gz_onboard.vehicle import read_vehicle
-from tests.display.served import PACK, Own, cells, odometer, own_frame
+from tests.display.served import PACK, Own, cells, odometer, own_frame, second
 from tests.display.test_picture import BUS, HEALTHY
-from tests.display.test_terminal import second
 
 REFERENCE = read_vehicle("reference")
 DAY = 86_400 * 10**9

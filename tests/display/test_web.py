@@ -11,8 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -27,17 +26,9 @@ from gz_onboard.display.server import MAX_THREADS, Feed, served
 from gz_onboard.errors import InputError
 from tests.display.served import Sender, dashboard
 from tests.display.test_picture import HEALTHY
-from tests.support import HEARS_CTRL_C, ROOT
+from tests.support import HEARS_CTRL_C, ROOT, wait_for
 
 LONG = 60.0  # s: no wait is as long, on whatever machine
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + LONG
-    while not (found := condition()):
-        assert time.monotonic() < end, f"not within {LONG:g} s: {what}"
-        time.sleep(0.05)
-    return found
 
 
 def latest(address: str) -> dict[str, Any]:
@@ -114,21 +105,6 @@ def test_the_stream_follows_the_frames():
         assert next(p for p in pictures if p["range"]["km"])["range"]["km"] == 34.21
         sender.estimate = replace(HEALTHY, range=33_000.0, reasons=HEALTHY.reasons)
         assert next(p for p in pictures if p["range"]["km"] != 34.21)["range"]["km"] == 33.0
-
-
-def test_a_silent_bus_is_told_though_nothing_comes():
-    with dashboard("silent") as address, stream(address) as pictures:
-        with Sender("silent", HEALTHY):
-            next(p for p in pictures if p["range"]["km"] and p["battery"]["soc_percent"])
-        sent = time.monotonic()
-        gone = next(p for p in pictures if p["battery"]["soc_percent"] is None)
-        assert gone["range"]["km"] == 34.21  # its time-out is ten times as long
-        assert time.monotonic() - sent > 0.5
-        silent = next(p for p in pictures if "silent" in p["alerts"])
-        assert silent["range"] == {"km": None, "p10_km": None, "p90_km": None}
-        with Sender("silent", replace(HEALTHY, range=30_000.0)):  # a daemon that was started anew
-            back = next(p for p in pictures if p["range"]["km"])
-        assert back["range"]["km"] == 30.0
 
 
 def test_a_loop_that_hangs_gives_no_old_picture(monkeypatch, feed):
