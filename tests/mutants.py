@@ -182,9 +182,7 @@ class Checkouts:
         for i in range(jobs):
             copy = folder / str(i)
             shutil.copytree(ROOT / "gz_onboard", copy / "gz_onboard", ignore=shutil.ignore_patterns("__pycache__"))
-            shutil.copytree(
-                ROOT / "tests", copy / "tests", ignore=shutil.ignore_patterns("__pycache__", "node_modules")
-            )
+            shutil.copytree(ROOT / "tests", copy / "tests", ignore=shutil.ignore_patterns("__pycache__"))
             for other in ROOT.iterdir():
                 if other.name not in ("gz_onboard", "tests", ".git"):
                     (copy / other.name).symlink_to(other)

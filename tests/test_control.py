@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import stat
-from types import SimpleNamespace
 
 import pytest
 
@@ -106,10 +105,3 @@ def test_the_command(listening, tmp_path, capsys):
     file.write_text("distance_m\n0\n0\n")
     assert main(["route", str(file), "--socket", str(path)]) == 2
     assert "way.route.csv:3: distance_m: 0 m does not increase" in capsys.readouterr().err
-
-
-def test_without_a_path_it_does_not_listen():
-    it = Control(None, SimpleNamespace)  # type: ignore[arg-type]
-    it.start()
-    it.take()
-    it.close()

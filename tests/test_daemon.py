@@ -26,7 +26,6 @@ from gz_onboard import state
 from gz_onboard.can._can import LibraryBus
 from gz_onboard.can.channel import CanChannel
 from gz_onboard.can.recorder import LogLimits, Recorder
-from gz_onboard.cli import main
 from gz_onboard.daemon.command import _lock
 from gz_onboard.daemon.loop import Daemon
 from gz_onboard.errors import InputError
@@ -201,36 +200,17 @@ def is_fresh(daemon: Daemon) -> bool:
 
 @pytest.mark.parametrize(
     ("odd", "said"),
-    [({"key": "another scooter|10s4p"}, "['another scooter', '10s4p'] saved"), ({"version": 99}, "is of version 99")],
-)
-def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, odd: Snapshot, said: str
-):
-    caplog.set_level(logging.INFO)
-    file = tmp_path / "scooter.json"
-    state.write(file, state.encode(learned | odd, time.time()))
-    text = file.read_bytes()
-    daemon = Daemon(reference(), [], None, file)
-    daemon.stop()
-    daemon.run()
-    assert said in caplog.text
-    assert "saved state not used, kept as" in caplog.text
-    assert is_fresh(daemon)
-    (aside,) = tmp_path.iterdir()  # nothing is known yet, so nothing is saved
-    assert aside.read_bytes() == text
-
-
-@pytest.mark.parametrize(
-    ("odd", "said"),
     [
         ({"soc": 5.0}, "state.soc is 5.0, not from 0 to 1"),
         ({"soc_variance": "a"}, "state.soc_variance is 'a'"),
         ({"learned": [1, 2]}, "state.learned has [1, 2], not "),
         ({"more": 1.0}, "state has "),
+        ({"key": "another scooter|10s4p"}, "['another scooter', '10s4p'] saved"),
+        ({"version": 99}, "is of version 99"),
         ({"v1": float("nan")}, "state.v1 is nan"),
     ],
 )
-def test_a_damaged_state_is_refused_whole_and_the_one_before_is_used(
+def test_a_state_that_is_damaged_or_does_not_fit_is_refused_whole_and_the_one_before_is_used(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, odd: Snapshot, said: str
 ):
     file = tmp_path / "scooter.json"
@@ -246,19 +226,6 @@ def test_a_damaged_state_is_refused_whole_and_the_one_before_is_used(
     found = Daemon(reference(), [], None, file).restore()
     assert found is not None
     assert found["soc"] == 0.41
-
-
-def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    caplog.set_level(logging.INFO)
-    (tmp_path / "file").write_text("in the way")
-    with Scene(bus, state_file=tmp_path / "file" / "state" / "scooter.json") as scene:
-        scene.ride(3.0)
-        assert scene.daemon._keeper is not None
-        scene.daemon._keeper.save(scene.daemon.pipeline, time.time_ns())
-        last = scene.daemon.pipeline.last
-        assert last is not None
-        assert last.range is not None
-    assert caplog.text.count("cannot save the state") == 1
 
 
 def test_a_state_that_cannot_be_saved_is_told_and_counts_at_the_end(
@@ -490,44 +457,3 @@ def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(tmp_
         take("socketcan", f"{name}x", tmp_path / "b")
         take("virtual", name, tmp_path / "b")
     take("socketcan", name, tmp_path / "a")
-
-
-def test_the_command_says_so_and_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with holder("udp_multicast", "239.0.0.77", tmp_path):
-        arguments = ["run", "--interface", "virtual", "--channel", "x", "--state-dir", str(tmp_path)]
-        assert main(arguments) == 2
-    assert "another gz-onboard run uses it" in capsys.readouterr().err
-
-
-def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
-    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    asked, answer = threading.Event(), threading.Event()
-
-    def hang(_: int) -> None:
-        asked.set()
-        answer.wait(60)
-
-    monkeypatch.setattr(os, "fdatasync", hang)
-    monkeypatch.setattr("gz_onboard.daemon.loop.STOP_S", 0.2)
-    channel = CanChannel("virtual", bus)
-    channel.open()
-    file = tmp_path / "scooter.json"
-    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", limits=LogLimits(sync_s=0.1)), file)
-    frames = Scooter().steady(2.0)
-    daemon.step(frames[: len(frames) // 2], frames[len(frames) // 2][0])
-    daemon.step(frames[len(frames) // 2 :], frames[-1][0] + S)
-    assert daemon._log is not None
-    for seconds in range(2, 300):
-        daemon._log.sync(frames[-1][0] + seconds * S)
-        if asked.wait(0.1):
-            break
-    daemon.close()
-    assert "its end is lost" in caplog.text
-    assert "not saved" not in caplog.text
-    answer.set()
-    last = daemon.pipeline.last
-    found = state.load(file, time.time())
-    assert last is not None
-    assert found is not None
-    assert found[0]["soc"] == last.soc

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
 from gz_onboard.toml import Table
@@ -150,21 +148,3 @@ def test_a_file_that_is_not_toml(tmp_path, content, parts):
         Table.read(tmp_path / "t.toml")
     for part in ["t.toml", *parts]:
         assert part in str(caught.value)
-
-
-keys = st.from_regex(r"[a-z]{1,6}", fullmatch=True)
-
-
-@given(st.lists(st.tuples(keys, st.lists(keys, unique=True, max_size=5)), max_size=5, unique_by=lambda t: t[0]))
-def test_the_line_of_any_key(tmp_path_factory, tables):
-    lines, where = [], {}
-    for name, entries in tables:
-        lines.append(f"[{name}]")
-        for key in entries:
-            lines.append(f"{key} = 1")
-            where[name, key] = len(lines)
-    file = tmp_path_factory.mktemp("toml") / "t.toml"
-    file.write_text("\n".join(lines))
-    table = Table.read(file)
-    for (name, key), line in where.items():
-        assert line_of(table.table(name).error("x", key)) == line
