@@ -215,18 +215,6 @@ def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
     assert shown == pytest.approx(raw)
 
 
-@pytest.mark.parametrize("slope", [-0.05, 0.05])
-def test_a_route_with_other_hills_than_are_ridden_is_left_and_taken_up_again(slope):
-    """Heights of another road: for a kilometre it is believed, then the range is that without it."""
-    rider, states = Rider(way(20e3, grade=lambda x: slope if x < 6e3 else 0.0)), []
-    rider.settled()
-    for seconds, ridden in ((60, 0.0), (60, 0.0), (900, None)):
-        rider.ride(seconds, 1000.0, slope=ridden)
-        states.append(rider.forecast.outlook.route_state)
-        assert (rider.ask() is FREE) == (states[-1] == RouteState.OFF)
-    assert states == [RouteState.ON, RouteState.OFF, RouteState.ON]
-
-
 def test_its_end_is_the_end_of_it():
     rider = Rider(way(1e3))
     rider.ride(120, 1000.0)
