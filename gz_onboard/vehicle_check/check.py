@@ -24,21 +24,23 @@ from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.recording import Recording, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.reports.results import clock, leap_text
 from gz_onboard.vehicle import Vehicle
+from gz_onboard.vehicle_check.cells import check_cells
 from gz_onboard.vehicle_check.finding import (
     NEEDS,
     Feature,
     Finding,
     Looks,
+    accused,
     features_of,
     features_text,
     right,
     unknown,
     wrong,
 )
-from gz_onboard.vehicle_check.motion import check_accelerations, check_speeds, check_turning
-from gz_onboard.vehicle_check.others import check_others
-from gz_onboard.vehicle_check.pack import POWER, PackRide, check_pack, drawn
-from gz_onboard.vehicle_check.seconds import FEWEST, Seconds, seconds_of
+from gz_onboard.vehicle_check.limits import check_limits
+from gz_onboard.vehicle_check.predictions import LOAD, PackRide, check_predictions
+from gz_onboard.vehicle_check.seconds import FEWEST, seconds_of
+from gz_onboard.vehicle_check.ways import check_speeds
 
 CHECK_VERSION = 1
 RARE = 0.9  # of the time: a signal that is there for less is reported
@@ -90,31 +92,32 @@ def check_log(
         progress(len(frames))
     samples, (duration, end) = Recording(ride_name(log), columns, facts_of(log)), _passed(columns)
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
-    lengths = {} if not isinstance(frames, FrameColumns) else _lengths(frames)
-    findings += [*_never_came(codec, columns, lengths, duration), *_dropped(codec, columns)]
+    findings += [*_never_came(codec, columns, frames, duration), *_dropped(codec, columns)]
     findings += _unanswered(codec, columns)
-    if columns:
-        ride = seconds_of(samples, vehicle)
-        if len(ride.time) < FEWEST:
-            findings.append(unknown("length", (), f"{duration:.1f} s: most checks need {FEWEST} s and more"))
-        findings += check_ride(ride, vehicle, samples.rider_mass)
+    ride = seconds_of(samples, vehicle) if columns else {}
+    if columns and duration < FEWEST:
+        findings.append(unknown("length", (), f"{duration:.1f} s: most checks need {FEWEST} s and more"))
+    if ride:
+        of_ride, pack = check_ride(ride, vehicle, samples.rider_mass)
+        findings += of_ride
         if not quick and any(one.looks is Looks.WRONG for one in findings):
             findings.append(unknown("on board", (), "not tried: what looks wrong would mislead it"))
         elif not quick:
-            load_fits = all(one.looks is Looks.RIGHT for one in findings if one.check == POWER.check)
-            findings += on_board(log, vehicle, load_fits, drawn(ride, vehicle))
+            load_fits = all(one.looks is Looks.RIGHT for one in findings if one.check == LOAD)
+            findings += on_board(log, vehicle, load_fits, pack)
     seen = [_seen(source, codec, columns, (duration, end), findings) for source in mapping.sources]
     return Checked(str(log), duration, seen, findings, features_of(columns))
 
 
-def check_ride(ride: Seconds, vehicle: Vehicle, payload: float | None) -> list[Finding]:
-    """Return the findings of a ride about itself and the vehicle file; payload [kg], if known."""
-    speeds = check_speeds(ride, vehicle)
-    speed = speeds.speeds[speeds.best] if speeds.best else None
-    findings = [*speeds.findings, *check_accelerations(ride, speeds), *check_turning(ride, speeds)]
-    doubted = {role for one in speeds.findings if one.looks is Looks.WRONG for role in one.roles}
-    of_pack, of = check_pack(ride, vehicle, speed if speeds.sure else None, payload, doubted)
-    return [*findings, *of_pack, *check_others(ride, speed, of.current if of else None, speeds.bench)]
+def check_ride(
+    ride: Mapping[str, Array], vehicle: Vehicle, payload: float | None
+) -> tuple[list[Finding], PackRide | None]:
+    """Return the findings of a ride about itself and the vehicle file, and its pack; payload [kg], if known."""
+    ways = check_speeds(ride, vehicle)
+    trusted = {role: values for role, values in ride.items() if role not in accused(ways.findings)}
+    by_others, pack = check_predictions(trusted, vehicle, ways.best if ways.sure else None, payload)
+    by_cells = check_cells(ride, pack, accused(by_others)) if pack else []
+    return [*ways.findings, *by_others, *by_cells, *check_limits(ride, ways.best, ways.bench)], pack
 
 
 # --- frames and signals -----------------------------------------------------------------------------------------------
@@ -130,25 +133,15 @@ def _passed(columns: Columns) -> tuple[float, float]:
     return end - start - float(steps[steps > PAUSE_S].sum()), end
 
 
-def _lengths(frames: FrameColumns) -> dict[int, int]:
-    """Bytes of the last frame of each identifier."""
-    return dict(zip(frames.identifier.tolist(), frames.length.tolist(), strict=True))
-
-
-def _never_came(
-    codec: Codec, columns: Collection[str], lengths: Mapping[int, int], duration: float
-) -> Iterator[Finding]:
-    """Roles of the file that the range needs, and of which a log of that `duration` [s] has no value.
-
-    lengths: bytes by identifier.
-    """
+def _never_came(codec: Codec, columns: Collection[str], frames: object, duration: float) -> Iterator[Finding]:
+    """Roles of the file that the range needs, and of which a log of that `duration` [s] has no value."""
     needed, wanted = NEEDS["range"]
     for group in (*needed, *wanted):
         silent = [source for source in codec.mapping.sources if source.role in group]
         late = min((_stale(codec, source) for source in silent), default=0.0)
         if silent and not set(group) & set(columns) and duration > late:
             without = "no range" if group in needed else "no energy"
-            text = f"{words(silent[0].role)} never came: {without}{_likely_identifier(codec, silent[0], lengths)}"
+            text = f"{words(silent[0].role)} never came: {without}{_likely_identifier(codec, silent[0], frames)}"
             yield wrong("never came", tuple(source.role for source in silent), text)
 
 
@@ -158,7 +151,7 @@ def _stale(codec: Codec, source: Source) -> float:
     return STALE_PERIODS * period if period else TIMING.unknown_stale
 
 
-def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:
+def _likely_identifier(codec: Codec, source: Source, frames: object) -> str:
     """The unknown identifier that is most like that of a message which never came, if its frames are as long."""
     message = next((m for m in codec.mapping.database.messages if m.name == source.message), None)
     if message is None:
@@ -167,6 +160,9 @@ def _likely_identifier(codec: Codec, source: Source, lengths: Mapping[int, int])
         return f"; {message.name} came on channel {channel} as {hexadecimal(identifier)}: see [bus] of the vehicle file"
     wanted = hexadecimal(identifier_of(message))
     text = f"; {source.message} is {wanted} in the DBC file"
+    lengths = {}
+    if isinstance(frames, FrameColumns):
+        lengths = dict(zip(frames.identifier.tolist(), frames.length.tolist(), strict=True))
     digits = {
         one: sum(a != b for a, b in zip(hexadecimal(one), wanted, strict=True))
         for one in codec.unknown

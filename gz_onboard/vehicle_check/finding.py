@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Annotated
 
 from gz_onboard.estimator.signals import POSITION
@@ -25,58 +26,18 @@ class Looks(StrEnum):
 class Finding:
     """The result of one check, about one or more roles."""
 
-    check: Annotated[str, "what was compared"]
     looks: Annotated[Looks, "looks right, looks wrong, or cannot tell"]
+    check: Annotated[str, "what was compared"]
     roles: Annotated[Roles, "that it is about"]
     text: Annotated[str, "what was seen, in words"]
 
 
-def right(check: str, roles: Roles, text: str) -> Finding:
-    """Return a finding without a mistake."""
-    return Finding(check, Looks.RIGHT, roles, text)
+right, wrong, unknown = (partial(Finding, looks) for looks in Looks)
 
 
-def wrong(check: str, roles: Roles, text: str) -> Finding:
-    """Return a suspicion."""
-    return Finding(check, Looks.WRONG, roles, text)
-
-
-def unknown(check: str, roles: Roles, text: str) -> Finding:
-    """Return a finding of a ride that does not tell."""
-    return Finding(check, Looks.UNKNOWN, roles, text)
-
-
-@dataclass(frozen=True)
-class Expected:
-    """How one signal should follow another.
-
-    usual, possible: ratios of their sizes that look right, and that can be explained. blamed: the roles of a wrong sign
-    or size; by default all. sign, size, hidden, unsure: hints for a wrong sign or size, no correlation, and a possible
-    ratio.
-    """
-
-    check: str
-    roles: Roles
-    close: float  # correlation from which on they go together
-    usual: tuple[float, float] = (0.0, float("inf"))
-    possible: tuple[float, float] | None = None
-    blamed: Roles = ()
-    sign: str = "its sign, scale = -1"
-    hidden: str = "they hardly move together"
-    unsure: str = ""
-
-    def judge(self, correlation: float, ratio: float, text: str, size: str = "") -> Finding:
-        """Return the finding; size: hint for a wrong ratio."""
-        blamed = self.blamed or self.roles
-        if correlation < -self.close:
-            return wrong(self.check, blamed, f"{text}: {self.sign}")
-        if correlation < self.close:
-            return unknown(self.check, self.roles, f"{text}: {self.hidden}")
-        if self.usual[0] < ratio < self.usual[1]:
-            return right(self.check, self.roles, text)
-        if self.possible and self.possible[0] < ratio < self.possible[1]:
-            return unknown(self.check, self.roles, f"{text}: {self.unsure}")
-        return wrong(self.check, blamed, text + size)
+def accused(findings: Iterable[Finding]) -> set[str]:
+    """Return the roles that look wrong."""
+    return {role for one in findings if one.looks is Looks.WRONG for role in one.roles}
 
 
 # --- features ---------------------------------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from math import copysign
 
 import numpy as np
@@ -21,30 +19,11 @@ ALIKE = 0.06  # relative: a ratio that is so near that of two units is theirs
 RARER = 0.02  # relative: so much nearer it must be to a power of ten, or to two units that are both not of SI
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """A ride by role, each signal (n,) at `time` [s] with nan where it was not measured."""
+def seconds_of(samples: Recording, vehicle: Vehicle) -> dict[str, Array]:
+    """The signals of a ride by role, each (n,) on the grid, nan where it was not measured.
 
-    time: Array
-    columns: Mapping[str, Array]
-
-    def __contains__(self, role: str) -> bool:
-        return role in self.columns
-
-    def __getitem__(self, role: str) -> Array:
-        return self.columns[role]
-
-    def get(self, role: str) -> Array | None:
-        """That of `role`, or None."""
-        return self.columns.get(role)
-
-    def any_of(self, *roles: str) -> list[str]:
-        """Those of `roles` that there are."""
-        return [role for role in roles if role in self.columns]
-
-
-def seconds_of(samples: Recording, vehicle: Vehicle) -> Seconds:
-    """The samples of a ride on the grid, the delays and errors of the sensors that the file knows taken off."""
+    Delays and errors of the sensors that the file knows are taken off; roles without a value are left out.
+    """
     columns = true_columns(samples.columns, vehicle.parameters)
     late = delays(vehicle)
     start = min(times[0] for times, _ in columns.values())
@@ -57,7 +36,7 @@ def seconds_of(samples: Recording, vehicle: Vehicle) -> Seconds:
         on_grid = np.where(measured(times, at), averaged(times, turned, at, SECOND), np.nan)
         if np.isfinite(on_grid).any():
             found[role] = on_grid
-    return Seconds(grid - start, found)
+    return found
 
 
 def rate(values: Array) -> Array:
@@ -65,17 +44,16 @@ def rate(values: Array) -> Array:
     return np.gradient(values, SECOND) if len(values) > 1 else np.zeros_like(values)
 
 
-@dataclass(frozen=True)
-class Relation:
-    """How one signal goes with another: by what factor, how closely, over how many points."""
-
-    factor: float  # of the spreads, with the sign of the correlation
-    correlation: float
-    count: int
+def change(values: Array) -> Array:
+    """Return the difference (n,) of `values` (n,) to the second before; nan in the first."""
+    return np.diff(values, prepend=np.nan)
 
 
-def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
-    """How `y` goes with `x`, both (n,), `where` (n,) if given; None if there are too few, or one never moves."""
+def relation(x: Array, y: Array, where: Mask | None = None) -> tuple[float, float] | None:
+    """How `y` goes with `x`, both (n,), `where` (n,) if given: (ratio of their spreads, correlation).
+
+    The ratio has the sign of the correlation. None if there are too few points, or one never moves.
+    """
     known = np.isfinite(x) & np.isfinite(y)
     known = known & where if where is not None else known
     if known.sum() < FEWEST:
@@ -85,7 +63,7 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
     if width < 1e-9 or height < 1e-9:
         return None
     correlation = float(np.mean(a * b)) / (width * height)
-    return Relation(copysign(height / width, correlation), correlation, int(known.sum()))
+    return copysign(height / width, correlation), correlation
 
 
 def unit_of(role: str, ratio: float, alike: float = ALIKE) -> str:

@@ -18,7 +18,7 @@ from gz_onboard.recording.recording import Recording, read_recording
 from gz_onboard.vehicle import read_vehicle
 from gz_onboard.vehicle_check.check import check_log, check_ride, check_text, on_board
 from gz_onboard.vehicle_check.finding import Finding, Looks
-from gz_onboard.vehicle_check.pack import PackRide
+from gz_onboard.vehicle_check.predictions import PackRide
 from gz_onboard.vehicle_check.seconds import seconds_of, unit_of
 from tests.plant.logs import write_log
 from tests.plant.machine import scooter
@@ -41,10 +41,10 @@ MISTAKES = [
     ("accel_z", "scale = -1", "its sign"),
     ("rate_z", 'unit = "rad/s"', "deg/s taken for rad/s"),
     ("cell_temperature", "scale = 1.8, offset = 32", "°F taken for °C"),
-    ("cell_temperature", "offset = 273.15", "K taken for °C"),
+    ("cell_temperature", "offset = 273.15", "its unit may be K"),
     ("pack_voltage", "scale = 1.2", "off the pack's"),
     ("inverter_current", "scale = -1", "the sign of one"),
-    ("throttle", 'unit = "1"', "may be %"),
+    ("throttle", 'unit = "1"', "its unit may be %"),
     ("charge_plug", "scale = -1, offset = 1", "the other way round"),
     ("charge_plug", "offset = 3", "it goes to 3, and 1 is on; limits of [0|1] in the DBC file"),
     ("pack_voltage", "scale = 0.6", "V a cell of 14 in series, which have"),
@@ -84,7 +84,7 @@ def checked(ride: Recording, text: str = "", folder: Path = Path(), /, **changes
     if text:
         (folder / "v.toml").write_text(text, encoding="utf-8")
         vehicle = read_vehicle(folder / "v.toml")
-    return check_ride(seconds_of(Recording("x", columns), vehicle), vehicle, ride.rider_mass)
+    return check_ride(seconds_of(Recording("x", columns), vehicle), vehicle, ride.rider_mass)[0]
 
 
 def wrong_of(findings: list[Finding]) -> list[Finding]:
@@ -250,7 +250,7 @@ def elsewhere(ride: Recording, latitude: float, longitude: float) -> dict[str, t
 
 def said_of_positions(columns: dict[str, tuple[Array, Array]]) -> list[Finding]:
     findings = checked(Recording("x", {role: columns[role] for role in ("motor_speed", "latitude", "longitude")}))
-    return [one for one in findings if {"latitude", "longitude"} <= set(one.roles) and one.check != "stuck"]
+    return [one for one in findings if "latitude" in one.roles and one.check != "stuck"]
 
 
 @pytest.mark.parametrize("place", [(40.3, -83.5), (48.0, 11.0), (35.7, 139.7), (-33.9, 151.2), (0.2, 36.8)], ids=str)
@@ -267,9 +267,7 @@ def test_a_latitude_beyond_the_poles_needs_no_ride(rides):
     there = elsewhere(rides[0], 35.7, 139.7)
     standing = {role: (times, values * 0 + values[0]) for role, (times, values) in there.items()}
     (said,) = said_of_positions({**standing, "latitude": standing["longitude"], "longitude": standing["latitude"]})
-    assert "reaches 139.7°, beyond the poles: swapped with the longitude" in said.text
-    (said,) = said_of_positions({**standing, "latitude": standing["longitude"]})
-    assert "beyond the poles: a wrong scale" in said.text
+    assert "139.7 deg, expected is -90 to 90: swapped with the longitude" in said.text
 
 
 UNSEEN = {"latitude": 0.0, "longitude": 0.0, "odometer": 0.0}
