@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 FARTHEST = 1e30  # of a limit of a signal; some editors write out those of its type
 LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
+_VALUE_NAMES = re.compile(r'^[ \t]*VAL_ (?:[^;"\n]|"[^"\n]*")*;', re.M)
+"""They are of no use for reading, and cantools refuses those of signals that are not there."""
 _WIDE = re.compile(r"\b((?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)\s+)(\d{4,9})\b")
 _MESSAGE_NUMBER = re.compile(r"^[ \t]*BO_[ \t]+(\d{4,9})\b", re.M)
 _BUS_LINE = re.compile(r"^[ \t]*BS_[ \t]*:", re.M)
@@ -113,6 +115,8 @@ class _DbcFile:
 
     def __init__(self, name: Path, text: str, left_out: LeftOut | None) -> None:
         self.name = name
+        if left_out is not None:
+            text = _VALUE_NAMES.sub("", text)
         self._lines = _completed(name, text).split("\n")
         self._left_out = left_out
         self._said: dict[str, None] = {}  # each problem once, with its line
@@ -160,24 +164,16 @@ class _DbcFile:
                 kind, said = type(error).__name__, str(error)
                 unforeseen = isinstance(error, LookupError)  # by cantools, which has not met such a file
                 problems.append(f"cantools cannot read it ({kind}: {said})" if unforeseen else said or kind)
-                if self._left_out is None or len(problems) > MOST_BROKEN or not self._mend(problems[-1]):
+                if self._left_out is None or len(problems) > MOST_BROKEN or not self._leave_out(problems[-1]):
                     raise self.invalid(problems[0]) from error
 
-    def _mend(self, problem: str) -> bool:
-        """Leave out the lines that cantools' `problem` names; False if they are not known."""
-        if syntax := re.search(r"line (\d+), column", problem):
-            at = int(syntax[1]) - 1
-            return at < len(self._lines) and not _DECIDES_OTHERS.match(self._lines[at]) and self._leave_out(at, problem)
-        unused = re.findall(r"^\s*(VAL_ \d+ \w+)$", problem, re.M)
-        for start in unused:
-            pattern = re.compile(rf"\s*{start.replace(' ', ' +')}\b")
-            for at in [i for i, line in enumerate(self._lines) if pattern.match(line)]:
-                self._leave_out(at, f"there is no signal for {start}")
-        return bool(unused)
-
-    def _leave_out(self, at: int, problem: str) -> bool:
-        """Blank the line of index `at`, and behind a message its signals: the message before must not get them."""
-        if not self._lines[at].strip():
+    def _leave_out(self, problem: str) -> bool:
+        """Blank the line that cantools' `problem` names, and behind a message its signals: the message before must not
+        get them. False if the line is not known or decides how others are read.
+        """
+        syntax = re.search(r"line (\d+), column", problem)
+        at = int(syntax[1]) - 1 if syntax else len(self._lines)
+        if at >= len(self._lines) or not self._lines[at].strip() or _DECIDES_OTHERS.match(self._lines[at]):
             return False
         end = at + 1
         while self._lines[at].lstrip().startswith("BO_ ") and _SIGNAL_NAME.match("".join(self._lines[end : end + 1])):
