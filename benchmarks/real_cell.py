@@ -11,10 +11,10 @@ filter is that of the on-board estimator, fed with events once a second; the dri
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from math import exp, nan
+from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,6 @@ from gz_onboard.calibration.result import Found, Result
 from gz_onboard.calibration.table import Measurements, Named, read_table
 from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.estimator.battery_priors import PRIOR
-from gz_onboard.estimator.cells import CellEffects
 from gz_onboard.events import Group
 from gz_onboard.model.battery import Battery
 from gz_onboard.model.effects import charge_transfer, slow_relaxation
@@ -175,29 +174,6 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     )
 
 
-class TwoPairs(CellEffects):
-    """The effects in the cells with a second, slow RC pair that follows the current alone."""
-
-    slow_resistance: Mesh
-    slow_time: Mesh
-    v2 = 0.0
-
-    def step(
-        self,
-        battery: Battery,
-        dt: float,
-        current: float,
-        soc: float,
-        temperature: float,
-        others: Mapping[str, float] | None = None,
-    ) -> None:
-        super().step(battery, dt, current, soc, temperature, others)
-        decay = exp(-dt / self.slow_time.at(soc, temperature)[0])
-        self.v2 = decay * self.v2 + (1 - decay) * self.slow_resistance.at(soc, temperature)[0] * current
-        self.overpotential += self.v2
-        self.mean_overpotential += self.v2
-
-
 @dataclass(frozen=True)
 class Setting:
     """A filter with its numbers."""
@@ -205,7 +181,6 @@ class Setting:
     name: str
     battery: Battery
     result: Result
-    slow: tuple[Mesh, Mesh] | None = None
 
 
 @dataclass(frozen=True)
@@ -241,13 +216,10 @@ def estimator_of(setting: Setting, offset: float) -> EventEstimator:
             values[parameter.name] = found.value, found.sd
     for name, (value, sd) in values.items():
         known[name] = replace(known[name], value=value, sd=sd)
-    beside = {**result.effects, **({"slow_relaxation": False} if setting.slow else {})}
-    model = Model(tuple(e for e in vehicle.model.effects if beside.get(e.name, True)), Parameters(known))
+    effects = tuple(e for e in vehicle.model.effects if result.effects.get(e.name, True))
+    model = Model(effects, Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = EventEstimator(groups, battery, model, vehicle.riding)
-    if setting.slow:
-        estimator.pack.effects = effects = TwoPairs(model, battery)
-        effects.slow_resistance, effects.slow_time = setting.slow
     estimator.forecaster._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
     cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.load
@@ -315,28 +287,17 @@ def pulse_resistance(table: Measurements, capacity: float) -> dict[float, float]
 
 
 def settings(rest: Result, result: Result) -> list[Setting]:
-    """The filter on board, without its rest voltage over temperature, and with a second pair."""
+    """The filter on board, and the same without its rest voltage over temperature."""
     result.parameters["cell_capacity"] = rest.parameters["cell_capacity"]
     capacity = result.curves["battery.capacity"]
     at_25 = float(np.interp(25, capacity.axes["temperature"], capacity.value))
-    one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
-    single, double = battery_of(one, result, at_25), battery_of(two, result, at_25)
-    assert two.slow_resistance is not None
-    assert two.slow_time is not None
-    axes = double.r0.soc, double.r0.temperature
-    slow = tuple(
-        Mesh(*axes, tuple(map(tuple, t.tolist())), geometric=True) for t in (two.slow_resistance, two.slow_time)
-    )
+    battery = battery_of(pulse.circuit(result), result, at_25)
     return [
-        Setting("on board: one RC pair and slow relaxation", single, result),
-        Setting("rest voltage one for all temperatures", _unshifted(single), result),
-        Setting("two RC pairs", double, result, slow=(slow[0], slow[1])),
-        Setting("two RC pairs, rest voltage one for all", _unshifted(double), result, slow=(slow[0], slow[1])),
+        Setting("on board: one RC pair and slow relaxation", battery, result),
+        Setting(
+            "rest voltage one for all temperatures", replace(battery, rest_shift_curve=None, rest_shift_sd=0.0), result
+        ),
     ]
-
-
-def _unshifted(battery: Battery) -> Battery:
-    return replace(battery, rest_shift_curve=None, rest_shift_sd=0.0)
 
 
 def jobs(work: tuple[Setting, Cycle, Case]) -> Score:
@@ -385,9 +346,8 @@ def _tables(result: Result) -> list[str]:
     c = result.curves
     lines = [
         "",
-        "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s "
-        "| errs by, mV, for, s |",
-        "|---" * 8 + "|",
+        "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | errs by, mV, for, s |",
+        "|---" * 6 + "|",
     ]
     soc = c["battery.r0"].axes["soc"]
     k = int(np.argmin(np.abs(soc - 0.5)))
@@ -397,8 +357,7 @@ def _tables(result: Result) -> list[str]:
         shift = 1e3 * written[j]
         lines.append(
             f"| {t:.0f} | {c['battery.capacity'].value[j]:.3f} | {shift:+.0f} | "
-            f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['slow_resistance'].value[j, k]:.0f} | "
-            f"{c['slow_time'].value[j, k]:.0f} | {1e3 * c['battery.voltage_error'].value[j]:.0f}, "
+            f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['battery.voltage_error'].value[j]:.0f}, "
             f"{c['voltage_error_time'].value[j]:.0f} |"
         )
     return lines
@@ -449,30 +408,21 @@ def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: lis
 
 
 def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]:
-    one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
+    cell = pulse.circuit(result)
     bins = ((-99, -1), (-1, 0.3), (0.3, 1.5), (1.5, 4), (4, 8), (8, 99))
     heads = ["below -1 A", "-1 to 0.3 A", "0.3 to 1.5 A", "1.5 to 4 A", "4 to 8 A", "above 8 A"]
-    lines = [
-        "| °C | one pair: RMS (mean) | two pairs: RMS (mean) | " + " | ".join(heads) + " |",
-        "|---" * (3 + len(bins)) + "|",
-    ]
+    lines = ["| °C | RMS (mean) | " + " | ".join(heads) + " |", "|---" * (2 + len(bins)) + "|"]
     for t in TEMPERATURES:
         mine = [c for c in work if c.temperature == t]
         capacity = setting.battery.cell_capacity(t)
         use = [1 - c.drawn / capacity > 0.15 for c in mine]
-        e1, e2 = (
-            np.concatenate([1e3 * open_loop(x, c, capacity)[u] for c, u in zip(mine, use, strict=True)])
-            for x in (one, two)
-        )
+        error = np.concatenate([1e3 * open_loop(cell, c, capacity)[u] for c, u in zip(mine, use, strict=True)])
         i = np.concatenate([c.current[u] for c, u in zip(mine, use, strict=True)])
         cells = []
         for low, high in bins:
             part = (i >= low) & (i < high)
-            cells.append(f"{e1[part].mean():+.0f}" if np.count_nonzero(part) > 30 else "–")
-        lines.append(
-            f"| {t} | {np.sqrt(np.mean(e1**2)):.0f} ({e1.mean():+.0f}) | {np.sqrt(np.mean(e2**2)):.0f} "
-            f"({e2.mean():+.0f}) | {' | '.join(cells)} |"
-        )
+            cells.append(f"{error[part].mean():+.0f}" if np.count_nonzero(part) > 30 else "–")
+        lines.append(f"| {t} | {np.sqrt(np.mean(error**2)):.0f} ({error.mean():+.0f}) | {' | '.join(cells)} |")
     return lines
 
 

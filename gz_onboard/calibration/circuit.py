@@ -55,12 +55,11 @@ PAIR_FIT = PairFitConfig()
 
 @dataclass(frozen=True)
 class Reaction:
-    """The parameters of the effect `charge_transfer`: resistance [ohm], activation [K] and time [s], with their sds."""
+    """The parameters of the effect `charge_transfer`: resistance [ohm], activation [K] and time [s]."""
 
     resistance: float = 0.0
     activation: float = 0.0
     time: float = 1.0
-    sd: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def overpotential(self, flowed: Array, dt: Array, temperature: Array) -> Array:
         """What it takes from the voltage (m,) [V] of a cell that has rested.
@@ -82,10 +81,11 @@ NO_REACTION = Reaction()
 
 @dataclass(frozen=True)
 class Circuit:
-    """Tables of one cell: R0, one fast RC pair and, if `slow_resistance` is given, a slow one.
+    """Tables of one cell, and the effects that it shows.
 
-    ocv: (n,) [V] over ocv_soc. r0, r1 [ohm], c1 [F], slow_resistance [ohm], slow_time [s]: (temperatures, soc).
-    capacity: (temperatures,) [A·h]. rest_shift: (temperatures,) [V], how much higher the cell rests than `ocv`.
+    ocv: (n,) [V] over ocv_soc. r0, r1 [ohm], c1 [F]: (temperatures, soc). capacity: (temperatures,) [A·h]. slow:
+    resistance [ohm] and time [s] of the effect `slow_relaxation`. rest_shift: (temperatures,) [V], rest voltage above
+    `ocv`.
     """
 
     ocv_soc: Array
@@ -96,8 +96,7 @@ class Circuit:
     r0: Array
     r1: Array
     c1: Array
-    slow_resistance: Array | None = None
-    slow_time: Array | None = None
+    slow: tuple[float, float] | None = None
     rest_shift: Array | None = None
     reaction: Reaction = NO_REACTION
 
@@ -136,10 +135,9 @@ def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array,
     tables, over = (cell.r0, cell.r1, cell.c1), (cell.soc, cell.temperature)
     r0, r1, c1 = (bilinear_over(*over, t, soc, temperature, geometric=True) for t in tables)
     pairs = follow(r1 * flowed, dt, r1 * c1)
-    if cell.slow_resistance is not None and cell.slow_time is not None:
-        slow = (cell.slow_resistance, cell.slow_time)
-        r2, tau = (bilinear_over(*over, t, soc, temperature, geometric=True) for t in slow)
-        pairs = pairs + follow(r2 * flowed, dt, tau)
+    if cell.slow is not None:
+        resistance, time = cell.slow
+        pairs = pairs + follow(resistance * flowed, dt, time)
     pairs = pairs + cell.reaction.overpotential(flowed, dt, temperature)
     rest = extended_over(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
     return np.asarray(terminal_voltage(rest, r0, current, pairs))
@@ -202,7 +200,6 @@ class Branches:
     priors' own doubt leaves. covered: (n,), False at nodes without a pulse near.
     """
 
-    soc: Array
     resistance: Array
     shift: Array
     covariance: Array
@@ -285,7 +282,6 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     scores = of.right[used] - of.gram[used] @ p
     covariance = (bread @ (scores.T @ scores + prior) @ bread).reshape(branches + 1, n, branches + 1, n)
     return Branches(
-        of.soc,
         p[:-n].reshape(branches, n),
         p[-n:],
         np.array([covariance[:-1, k, :-1, k] for k in range(n)]),
@@ -332,58 +328,53 @@ def smoothness(soc: Array, scale: Array) -> Array:
 
 
 class Reduction:
-    """From many pairs to `count` pairs, under `loads`: currents from rest, one value a second.
+    """From many RC pairs to the one that is nearest under `loads`: currents from rest, one value a second.
 
-    beside: (resistance [ohm], time constant [s]) of a further pair that is given; the `count` are what it lacks.
+    slow: (resistance [ohm], time constant [s]) of a further pair, which the one found leaves out.
     """
 
-    def __init__(self, loads: Sequence[Array], count: int = 1, beside: tuple[float, float] | None = None) -> None:
-        def filtered_by(tau: float) -> Array:
+    def __init__(self, loads: Sequence[Array], slow: tuple[float, float] | None = None) -> None:
+        def relaxing(tau: float) -> Array:
             a = np.exp(-1.0 / tau)
             return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))
-        given = [beside] if beside else []
-        self._beside = np.array([-resistance for resistance, _ in given])
-        many = np.column_stack([load, *(filtered_by(tau) for tau in (*TIMES, *(time for _, time in given)))])
-        fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
-        slow = np.geomspace(150, 3000, 16)
-        columns = {tau: filtered_by(tau) for tau in (*fast.tolist(), *(slow.tolist() if count == 2 else ()))}
-        times = [(t,) for t in fast.tolist()] if count == 1 else [(t, u) for t in fast.tolist() for u in slow.tolist()]
-        self._times = np.array(times)
+        self._slow = [-slow[0]] if slow else []
+        many = np.column_stack([load, *map(relaxing, TIMES), *([relaxing(slow[1])] if slow else [])])
         gram = many.T @ many
+        self._times = np.geomspace(3, 300, 50)
         solved, left = [], []
-        for row in times:
-            g = np.column_stack([load, *(columns[t] for t in row)])
-            cross = g.T @ many
-            m = np.linalg.solve(g.T @ g, cross)
-            solved.append(m)
-            left.append(gram - cross.T @ m)
+        for tau in self._times.tolist():
+            one = np.column_stack([load, relaxing(tau)])
+            cross = one.T @ many
+            best = np.linalg.solve(one.T @ one, cross)
+            solved.append(best)
+            left.append(gram - cross.T @ best)
         self._solved, self._left = np.array(solved), np.array(left)
 
     def logs(self, resistances: Array) -> Array:
-        """(n, 1 + 2 count): ln of R0, R of each pair, τ of each pair, for `resistances` (1 + len(TIMES), n) [ohm]."""
-        resistances = np.vstack([resistances, np.tile(self._beside[:, None], resistances.shape[1])])
+        """(n, 3): ln of R0, R1 and τ1, for `resistances` (1 + len(TIMES), n) [ohm]."""
+        resistances = np.vstack([resistances, np.tile(np.reshape(self._slow, (-1, 1)), resistances.shape[1])])
         costs = np.einsum("kin,in->nk", self._left @ resistances, resistances)
-        every = np.moveaxis(self._solved @ resistances, -1, 0)
-        return np.array([self._nearest(cost, best) for cost, best in zip(costs, every, strict=True)])
+        solutions = np.moveaxis(self._solved @ resistances, -1, 0)
+        return np.array([self._nearest(*row) for row in zip(costs, solutions, strict=True)])
 
-    def _nearest(self, cost: Array, best: Array) -> Array:
-        """The row of `logs` of the least `cost` (times,) among the `best` (times, 1 + count), one for each of times."""
-        positive = np.all(best > 0, axis=1)
+    def _nearest(self, cost: Array, solution: Array) -> Array:
+        """The row of `logs` at the least `cost` (times,) of the `solution` (times, 2) for each time constant."""
+        positive = np.all(solution > 0, axis=1)
         if np.any(positive):
             cost = np.where(positive, cost, np.inf)
-        else:  # there is nothing that pairs could follow
-            best = np.maximum(best, PAIR_FIT.least)
+        else:  # there is nothing that a pair could follow
+            solution = np.maximum(solution, PAIR_FIT.least)
         k = int(np.argmin(cost))
-        solution, times = best[k], np.log(self._times[k])
-        if len(times) == 1 and 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):
+        found, time = solution[k], np.log(self._times[k])
+        if 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):  # between the times, by a parabola
             down, here, up = cost[k - 1 : k + 2]
             move = 0.5 * (down - up) / max(down - 2 * here + up, 1e-30)
             j = k + (1 if move > 0 else -1)
-            solution = best[k] + abs(move) * (best[j] - best[k])
-            times = times + abs(move) * (np.log(self._times[j]) - times)
-        return np.concatenate([np.log(solution), times])
+            found = found + abs(move) * (solution[j] - found)
+            time = time + abs(move) * (np.log(self._times[j]) - time)
+        return np.append(np.log(found), time)
 
     def spread(self, resistance: Array, covariance: Array) -> Array:
         """Covariance of a row of `logs`, from that of `resistance`: moved by one sd along the axes of its ellipsoid."""

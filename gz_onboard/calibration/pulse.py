@@ -3,7 +3,7 @@
 One table per temperature. Each test begins at full and rests before its pulses; what it rests at shows how much charge
 there is between full and empty at its temperature. Many RC pairs of fixed time constants are fitted, linear in every
 table (see `circuit`). Of these the slow ones become an effect, and the one pair that is nearest to the rest under a
-load like riding the tables; beside it the two that are nearest to all.
+load like riding the tables.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def calibrate_cell(
     loads: Sequence[Array] | None = None,
     held_out: Sequence[Measurements] = (),
 ) -> Result:
-    """``battery.r0``, ``r1``, ``c1``, ``capacity``, ``ocv``, and beside them a slow pair.
+    """``battery.r0``, ``r1``, ``c1``, ``capacity`` and ``ocv``.
 
     Also how far they err (see `_errors`), and ``battery.rest_shift``, if the rests show one (see `_shift_of_rests`).
 
@@ -118,9 +118,8 @@ def calibrate_cell(
     split = _moved_pieces(tests, nodes, volts)
     fitted = [fit_branches(x, leave_out=True) for x in split]
     rides = [riding_current(seed=k) for k in range(1, 4)] if loads is None else loads
-    two = _meshes(fitted, Reduction(rides, count=2))
     slow = _slow_relaxation(fitted, capacity.value, names, result)
-    reduction = Reduction(rides, beside=slow)
+    reduction = Reduction(rides, slow)
     one = _meshes(fitted, reduction)
     _rests(fitted, tests, ocv, names, result)
     temperature, amount, amount_sd = np.array([(t.temperature, t.capacity, t.capacity_sd) for t in tests]).T
@@ -128,7 +127,7 @@ def calibrate_cell(
     result.curves["battery.capacity"] = Curve({"temperature": temperature}, amount, amount_sd, "A·h", source)
     how = f"{names}: {len(TIMES)} RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
     covered = np.array([f.covered for f in fitted])
-    _tables(result, {"soc": SOC, "temperature": temperature}, covered, how, one, two)
+    _tables(result, {"soc": SOC, "temperature": temperature}, covered, how, one)
     for t, there in zip(tests, covered, strict=True):
         if not np.all(there):
             result.refusals.append(
@@ -141,23 +140,20 @@ def calibrate_cell(
     return result
 
 
-def circuit(result: Result, slow: bool = False) -> Circuit:
-    """The cell that `calibrate_cell` found, as on board; with `slow`, of two RC pairs, each in tables."""
-    c = result.curves
-    ocv, axes = c["battery.ocv"], c["battery.r0"].axes
-    prefix = "slow_" if slow else "battery."
-    tables = {name: c[prefix + name].value for name in ("r0", "r1", "c1")}
-    for parameter in slow_effect.PARAMETERS:
-        if slow:
-            tables[parameter.name] = c[parameter.name].value
-        elif parameter.name in result.parameters:
-            tables[parameter.name] = np.full_like(tables["r0"], result.parameters[parameter.name].value)
-    if "battery.rest_shift" in c:
-        tables["rest_shift"] = c["battery.rest_shift"].value
-    found = [result.parameters[p.name].value for p in FOUND if p.name in result.parameters]
-    reaction = Reaction(found[0], found[1], found[2]) if found else NO_REACTION
-    capacity = c["battery.capacity"].value
-    return Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, **tables, reaction=reaction)
+def circuit(result: Result) -> Circuit:
+    """The cell that `calibrate_cell` found, as on board."""
+    curves, found = result.curves, result.parameters
+    ocv, axes = curves["battery.ocv"], curves["battery.r0"].axes
+    r0, r1, c1, capacity = (curves[f"battery.{name}"].value for name in ("r0", "r1", "c1", "capacity"))
+    cell = Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, r0, r1, c1)
+    if result.effects[SLOW_RELAXATION]:
+        resistance, time = (found[p.name].value for p in slow_effect.PARAMETERS)
+        cell = replace(cell, slow=(resistance, time))
+    if result.effects.get(CHARGE_TRANSFER):
+        cell = replace(cell, reaction=Reaction(*(found[p.name].value for p in FOUND)))
+    if "battery.rest_shift" in curves:
+        cell = replace(cell, rest_shift=curves["battery.rest_shift"].value)
+    return cell
 
 
 # --- tests and their state of charge -------------------------------------------------------------------------------
@@ -390,10 +386,10 @@ def _curvature(cost: Callable[[Array], float], x: Array) -> Array:
 
 
 class CellTables(NamedTuple):
-    """R0, R of each pair, τ of each pair, each (temperatures, soc); their relative sd, and last that of C1."""
+    """R0, R1 [ohm] and C1 [F], each (temperatures, soc), and their relative sd."""
 
-    tables: list[Array]
-    sd: list[Array]
+    value: Array  # (3, temperatures, soc)
+    sd: Array
 
 
 def _meshes(fitted: Sequence[Branches], reduction: Reduction) -> CellTables:
@@ -411,41 +407,32 @@ def _meshes(fitted: Sequence[Branches], reduction: Reduction) -> CellTables:
         near = np.exp(-0.5 * ((SOC[:, None] - SOC) / PULSE.pooled) ** 2) * f.covered
         near[~f.covered] = np.eye(len(SOC))[~f.covered]
         sds.append(np.sqrt(near @ sd**2 / near.sum(axis=1)[:, None]))
-    return CellTables(list(np.array(tables).transpose(2, 0, 1)[:-1]), list(np.array(sds).transpose(2, 0, 1)))
+    value, sd = (np.array(rows)[:, :, [0, 1, 3]].transpose(2, 0, 1) for rows in (tables, sds))
+    return CellTables(value, sd)
 
 
 def _smooth(logs: Array, sds: Array) -> Array:
-    """Each column of `logs` (n, parts) made to bend little where its sd is large; ln C1 as a further column."""
-    result, first = np.empty_like(logs), (logs.shape[1] + 1) // 2
+    """Columns of `logs` (n, 3), ln of R0, R1, τ1, made to bend little where their sd is large; a fourth: ln C1."""
     bend = bends(SOC) / (PULSE.smooth * np.maximum(SOC[2:] - SOC[:-2], 0.1) / 0.2)[:, None]
     slope = np.diff(np.eye(len(SOC)), axis=0) / (PULSE.level_slope * np.maximum(np.diff(SOC), 0.05) / 0.1)[:, None]
-    for j in range(logs.shape[1]):
-        weight = 1 / np.maximum(sds[:, j], 0.02)
-        # Time constants hardly depend on SOC, and are known worst.
-        matrix = np.vstack([np.diag(weight), bend, *([slope] if j >= first else [])])
-        result[:, j] = np.linalg.solve(matrix.T @ matrix, weight**2 * logs[:, j])
-    return np.column_stack([result, result[:, first] - result[:, 1]])
+    time_prior = np.vstack([bend, slope])  # time constants hardly depend on SOC, and are known worst
+    columns = []
+    for log, sd, prior in zip(logs.T, sds.T, (bend, bend, time_prior), strict=True):
+        weight = 1 / np.maximum(sd, 0.02)
+        columns.append(np.linalg.solve(np.diag(weight**2) + prior.T @ prior, weight**2 * log))
+    r0, r1, time = columns
+    return np.column_stack([r0, r1, time, time - r1])
 
 
-def _tables(result: Result, axes: dict[str, Array], covered: Mask, how: str, one: CellTables, two: CellTables) -> None:
-    """The tables of one pair and of two, without an sd where not covered; pictures of the one."""
-    (r0, r1, time), sd = one
-    (slow_r0, fast, slow, fast_time, slow_time), slow_sd = two
-    for name, value, share, unit, what in (
-        ("battery.r0", r0, sd[0], "ohm", "R0"),
-        ("battery.r1", r1, sd[1], "ohm", "R1"),
-        ("battery.c1", time / r1, sd[3], "F", "τ1/R1"),
-        ("slow_r0", slow_r0, slow_sd[0], "ohm", "R0 beside two pairs"),
-        ("slow_r1", fast, slow_sd[1], "ohm", "R1 beside a slow pair"),
-        ("slow_c1", fast_time / fast, slow_sd[5], "F", "C1 beside a slow pair"),
-        ("slow_resistance", slow, slow_sd[2], "ohm", "slow pair"),
-        ("slow_time", slow_time, slow_sd[4], "s", "slow pair"),
-    ):
-        sds = np.where(covered, value * np.hypot(share, TESTER), np.nan)
-        result.curves[name] = Curve(axes, value, sds, unit, f"{how}; {what}")
-    for title, table, unit in (("R0", 1e3 * r0, "mΩ"), ("R1", 1e3 * r1, "mΩ"), ("C1", time / r1, "F")):
-        over_soc = tuple(PlotLine(f"{t:g} °C", SOC, row) for t, row in zip(axes["temperature"], table, strict=True))
-        result.panels.append(Panel(title, "state of charge", unit, over_soc))
+def _tables(result: Result, axes: dict[str, Array], covered: Mask, how: str, cell: CellTables) -> None:
+    """The tables of R0, R1 and C1, without an sd where not covered, with their pictures."""
+    rows = (("R0", "ohm", "R0", 1e3, "mΩ"), ("R1", "ohm", "R1", 1e3, "mΩ"), ("C1", "F", "τ1/R1", 1.0, "F"))
+    for (title, unit, what, scale, shown), value, share in zip(rows, *cell, strict=True):
+        sd = np.where(covered, value * np.hypot(share, TESTER), np.nan)
+        result.curves[f"battery.{title.lower()}"] = Curve(axes, value, sd, unit, f"{how}; {what}")
+        by_temperature = zip(axes["temperature"], scale * value, strict=True)
+        lines = tuple(PlotLine(f"{t:g} °C", SOC, row) for t, row in by_temperature)
+        result.panels.append(Panel(title, "state of charge", shown, lines))
 
 
 def _mesh_quality(result: Result, tests: Sequence[Tested], split: Sequence[Pieces], one: Reduction, names: str) -> None:
@@ -454,20 +441,19 @@ def _mesh_quality(result: Result, tests: Sequence[Tested], split: Sequence[Piece
     A group is what lies between two long rests.
     """
     halves, covered = [], np.tile((SOC > 0.19) & (SOC < 0.91), (len(tests), 1))
-    for odd in (0, 1):
+    for half in (0, 1):
         part = []
         for t, x in zip(tests, split, strict=True):
             group = np.searchsorted(t.rests, np.searchsorted(t.test.block, x.label))
-            part.append(fit_branches(x, group % 2 == odd))
+            part.append(fit_branches(x, group % 2 == half))
         covered &= np.array([f.covered for f in part])
-        halves.append(_meshes(part, one).tables)
+        halves.append(_meshes(part, one).value)
     if not covered.any():
         result.refusals.append("meshes: the pulses are too few to compare half of them with the other half")
         return
-    for name, unit, number in (("R0", "ohm", 0), ("R1", "ohm", 1), ("C1", "F", 2)):
-        even, other = ((x[number] / x[1] if number == 2 else x[number])[covered] for x in halves)
+    for name, unit, even, odd in zip(("R0", "R1", "C1"), ("ohm", "ohm", "F"), *halves, strict=True):
         what = f"mesh of {name}, SOC 0.2 to 0.9, half against half"
-        result.fits.append(score(what, unit, even, other, held_out=True, source=names))
+        result.fits.append(score(what, unit, even[covered], odd[covered], held_out=True, source=names))
 
 
 # --- rests and slow relaxation -------------------------------------------------------------------------------------
@@ -488,23 +474,21 @@ def _rests(fitted: Sequence[Branches], tests: Sequence[Tested], ocv: Curve, name
     sds = [
         np.where(f.covered, np.hypot(jackknife(f.shift, f.without[:, :, -1]), f.shift_prior), np.nan) for f in fitted
     ]
-    axes = {"soc": SOC, "temperature": np.array([t.temperature for t in tests])}
-    against = f"{names}: rest voltage against that near 25 degC"
-    result.curves["rest_shift"] = rests = Curve(axes, shifts - shifts[nearest], np.array(sds), "V", against)
-    _shift_of_rests(rests, nearest, names, result)
+    temperature = np.array([t.temperature for t in tests])
+    _shift_of_rests(temperature, shifts - shifts[nearest], np.array(sds), nearest, names, result)
     result.curves["battery.ocv"] = Curve({"soc": nodes}, ocv.value + shift, sd, "V", source)
 
 
-def _shift_of_rests(rests: Curve, reference: int, names: str, result: Result) -> None:
+def _shift_of_rests(temperature: Array, shifts: Array, sds: Array, reference: int, names: str, result: Result) -> None:
     """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``, if it is sure.
 
-    The mean over 15 to 95 % SOC; its sd holds how it varies there, since one number is to stand for all of it.
+    shifts, sds: (temperatures, len(SOC)) [V] against the test `reference`. The mean is over 15 to 95 % SOC; its sd
+    holds how it varies there.
     """
-    temperature = rests.axes["temperature"]
-    known = [MIDDLE & np.isfinite(sd) for sd in rests.sd]
+    known = [MIDDLE & np.isfinite(sd) for sd in sds]
     if len(temperature) < 2 or not all(map(np.any, known)):
         return
-    rows = [(row[k], sd[k]) for row, sd, k in zip(rests.value, rests.sd, known, strict=True)]
+    rows = [(row[k], sd[k]) for row, sd, k in zip(shifts, sds, known, strict=True)]
     mean, sd = np.array([(row.mean(), np.hypot(row.std(), s.mean())) for row, s in rows]).T
     others = np.arange(len(temperature)) != reference
     chance = float(chi2.sf(np.sum((mean[others] / np.maximum(sd[others], 1e-3)) ** 2), len(temperature) - 1))
@@ -580,25 +564,22 @@ class Residual(NamedTuple):
 
 
 def _errors(result: Result, tests: Sequence[Tested], names: str) -> None:
-    """How well the circuits follow the tests that they came from: fits, pictures and ``cell_voltage_error``."""
-    pairs = {"on board": circuit(result), "two pairs": circuit(result, slow=True)}
-    rms: dict[str, list[float]] = {"above": [], "below": []}  # 0.1 of SOC, of the circuit on board
-    left = []
+    """How well the circuit follows the tests that it comes from: fits, pictures and ``cell_voltage_error``."""
+    cell = circuit(result)
+    rms: dict[str, list[float]] = {"above": [], "below": []}  # 0.1 of SOC
+    residuals = []
     for t in tests:
         test, at = t.test, f"{t.temperature:g}"
-        for what, cell in pairs.items():
-            model = voltage(cell, test.flowed, test.current, test.dt, t.level, test.temperature)
-            for name, part in (("above", t.level > PULSE.empty), ("below", t.level <= PULSE.empty)):
-                if np.count_nonzero(part) > 20:
-                    about, data = f"voltage, {what}, {at} degC, SOC {name} 0.1", test.voltage[part]
-                    result.fits.append(score(about, "V", data, model[part], held_out=False, source=test.name))
-                    if what == "on board":
-                        rms[name].append(result.fits[-1].rms)
-            if what == "on board":
-                left.append(Residual(t.temperature, test.time, test.voltage - model, t.level, test.rest))
-                title = f"Pulse test at {at} °C"
-                result.panels += compared(title, "time [h]", "voltage [V]", test.time / HOUR, test.voltage, model)
-    voltage_errors(left, names, result)
+        model = voltage(cell, test.flowed, test.current, test.dt, t.level, test.temperature)
+        for name, part in (("above", t.level > PULSE.empty), ("below", t.level <= PULSE.empty)):
+            if np.count_nonzero(part) > 20:
+                about, data = f"voltage, on board, {at} degC, SOC {name} 0.1", test.voltage[part]
+                result.fits.append(score(about, "V", data, model[part], held_out=False, source=test.name))
+                rms[name].append(result.fits[-1].rms)
+        residuals.append(Residual(t.temperature, test.time, test.voltage - model, t.level, test.rest))
+        title = f"Pulse test at {at} °C"
+        result.panels += compared(title, "time [h]", "voltage [V]", test.time / HOUR, test.voltage, model)
+    voltage_errors(residuals, names, result)
     for parameter, where in (("cell_voltage_error", "above"), ("cell_voltage_error_empty", "below")):
         if rms[where] or where == "above":
             sd, source = float(np.sqrt(np.mean(np.square(rms[where])))), f"rms of the circuit {where} 10 % SOC"

@@ -145,9 +145,9 @@ def test_only_what_a_vehicle_file_holds_is_written(tmp_path):
     result = Result(
         "t",
         {"drag_area": Found(0.5, 0.1, "m²", "x"), "wind": Found(1, 1, "m/s", "x")},
-        {"slow_r0": Curve({"soc": one}, one, one, "ohm", "x")},
+        {"rest_shift": Curve({"soc": one}, one, one, "ohm", "x")},
         [(("wind", "drag_area"), pair)],
     )
     written = tmp_path / "v.toml"
     assert write_calibration(OWN / "reference.toml", [result], written).parameters["drag_area"] == 0.5
-    assert not re.search(r"\bwind =|slow_r0", written.read_text())
+    assert not re.search(r"\bwind =|rest_shift", written.read_text())

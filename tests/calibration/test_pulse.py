@@ -102,7 +102,7 @@ def test_rests_that_do_not_are_not_said_to():
 
 def test_tables_are_positive_and_marked_where_data_end():
     result = found()
-    for name in ("battery.r0", "battery.r1", "battery.c1", "slow_resistance", "slow_time"):
+    for name in ("battery.r0", "battery.r1", "battery.c1"):
         curve = result.curves[name]
         assert np.all(curve.value > 0)
         assert np.all(np.isnan(curve.sd[:, pulse.SOC < 0.03]))

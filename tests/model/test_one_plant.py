@@ -159,8 +159,7 @@ def test_calibration_has_the_same_voltage_of_a_cell(ride):
         r0,
         r1,
         c1,
-        slow_resistance=np.full_like(r0, P["slow_resistance"]),
-        slow_time=np.full_like(r0, P["slow_time"]),
+        slow=(P["slow_resistance"], P["slow_time"]),
         rest_shift=shift,
         reaction=Reaction(P["charge_transfer_resistance"], P["charge_transfer_activation"], P["charge_transfer_time"]),
     )
