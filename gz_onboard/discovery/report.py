@@ -27,6 +27,7 @@ from gz_onboard.discovery.judgement import (
 )
 from gz_onboard.discovery.mixed_model import LinearRide
 from gz_onboard.discovery.parameters import Candidate
+from gz_onboard.discovery.search import SEARCH
 from gz_onboard.reports.page import drawn, html_table, tiles, write_page
 from gz_onboard.reports.results import clock
 from gz_onboard.reports.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
@@ -372,7 +373,7 @@ def _details(report: Report) -> list[str]:
     if report.constancy:
         rows = []
         for s in report.constancy:
-            judged = "differs" if s.unequal else "alike" if abs(s.ratio) <= 0.5 else "cannot tell"
+            judged = "differs" if s.unequal else "alike" if abs(s.ratio) <= SEARCH.ratio else "cannot tell"
             rows.append([readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}", judged])
         parts.append(
             "<h2>Constancy of the causes</h2><p>Half the difference of left and right bends, of the upper and lower "

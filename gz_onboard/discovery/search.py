@@ -211,9 +211,9 @@ class Search:
         for _ in range(SEARCH.rounds):
             if not now.chosen:
                 break
-            offset = now.change
+            offset, change = self.offset.copy(), now.change  # of parameters without a cause, such as a delay, it stays
             for i in now.index(now.chosen):
-                offset[i] = now.limited_step(i, offset[i])
+                offset[i] = now.limited_step(i, float(change[i]))
             before, now = now.offset, now.moved(offset)
             now = replace(now, chosen=now.choose())
             if np.all(np.abs(offset - before) < SEARCH.settled * np.abs(offset) + 1e-9):
@@ -506,22 +506,22 @@ def accepted(search: Search) -> Search:
 def search_causes(problem: Search) -> Search:
     """The causes that are accepted, with the wind of each ride if winds are stronger than on healthy rides."""
     now = accepted(problem)
-    wind = next((cause for cause in now.causes.values() if cause.varies), None)
+    wind = next((cause for cause in problem.causes.values() if cause.varies), None)  # also one that was rejected
     if wind is None or wind.name in now.chosen:
         return now
     winds = own_winds(now, wind)
     if winds.score <= now.limit:
         return replace(now, winds=winds)
-    causes = {name: cause for name, cause in now.causes.items() if name != wind.name}
+    causes = {name: cause for name, cause in problem.causes.items() if name != wind.name}
     windy = accepted(with_winds(replace(problem, causes=causes), winds))
     rejected = {refused.name: refused for refused in (*now.rejected, *windy.rejected)}
-    refused = tuple(one for name, one in rejected.items() if name not in windy.chosen)
+    refused = tuple(one for name, one in rejected.items() if name not in (wind.name, *windy.chosen))
     return replace(windy, rejected=refused, winds=winds)
 
 
 def own_winds(now: Search, wind: Candidate) -> Winds:
     """The wind of each ride. It blows otherwise on another day, so that one vector common to the rides misses it."""
-    mixed, w = now.mixed, now.place[wind.name]
+    mixed, w = now.mixed, now.mixed.index(wind.names)
     blown = np.zeros((len(now.lines), len(mixed.mean)))
     rest = [i for i in range(len(mixed.mean)) if i not in w]
     spread = mixed.prior + np.diag(mixed.scatter)

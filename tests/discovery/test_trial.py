@@ -26,16 +26,26 @@ from benchmarks.trial import (
 from benchmarks.trial import summary as counted
 from gz_onboard.discovery import judgement, search
 from gz_onboard.discovery.baseline import baseline
+from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.judgement import VERDICTS
 from gz_onboard.discovery.mixed_model import LinearRide, MixedModel, Statistics
 from gz_onboard.discovery.mixed_model import initial as known_from
-from gz_onboard.discovery.search import carries_over, improves, with_observed_scatter, within_bounds, worsened
+from gz_onboard.discovery.search import (
+    Rejected,
+    Search,
+    carries_over,
+    improves,
+    with_observed_scatter,
+    within_bounds,
+    worsened,
+)
 from gz_onboard.recording.recording import Recording
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.discovery.material import search_of
 from tests.plant import cases as plant
 
 FIRST, CASES = 200_000, 8
+RIDE = Ride("made up", np.zeros(0), {}, {}, 0.25, None)
 SCOOTER = FIRST // plant.CASES_OF_A_SCOOTER
 
 
@@ -160,6 +170,30 @@ def test_differences_between_rides_widen_the_scatter_and_a_common_change_does_no
     assert common.scatter[i] == pytest.approx(known.scatter[i], rel=0.05)
     assert apart.scatter[i] > 3 * known.scatter[i]
     assert (apart.scatter >= known.scatter).all()
+
+
+def test_a_rejected_common_wind_leaves_the_winds_of_each_ride(mixed: MixedModel, monkeypatch):
+    rides = [replace(line, ride=RIDE) for line in rides_at(mixed, "wind_north", [6.0, -6.0])]
+    (east,) = mixed.index(["wind_east"])
+    for line in rides:
+        line.statistics.information[east, east] = 100.0
+    problem = search_of(mixed, rides, limit=1e6)
+    rejected = Rejected("headwind", "differs from ride to ride as much as it is", np.zeros(2))
+    rest = {name: cause for name, cause in problem.causes.items() if name != "headwind"}
+    monkeypatch.setattr(search, "accepted", lambda problem: replace(problem, causes=rest, rejected=(rejected,)))
+    found = search.search_causes(problem)
+    assert found.winds is not None and found.winds.score > 10
+
+
+def test_the_first_offset_stays_while_causes_are_linearised(mixed: MixedModel, monkeypatch):
+    delay, load = mixed.index(["pack_voltage_latency", "auxiliary_power"])
+    offset = np.zeros(len(mixed.names))
+    offset[delay] = 5.0
+    now = replace(search_of(mixed, rides_at(mixed, "auxiliary_power", [40.0, 40.0])), offset=offset)
+    monkeypatch.setattr(Search, "choose", lambda _: ("auxiliary_load",))
+    monkeypatch.setattr(Search, "moved", lambda now, offset: replace(now, offset=offset))
+    moved = now.selected().offset
+    assert moved[delay] == 5.0 and moved[load] > 1.0
 
 
 def models(**squares: tuple[float, float, float]) -> tuple[tuple[LinearRide, np.ndarray], ...]:
