@@ -779,7 +779,7 @@ class Discovered(Tabular):
         Raises InputError.
         """
         vehicle_output(Path(file), self.read)
-        return write_model(self.found, self.vehicle, Path(file))[1]
+        return write_model(self.found, self.vehicle, Path(file))
 
     @checked
     def write_report(self, file: PathLike) -> None:

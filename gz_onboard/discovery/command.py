@@ -81,9 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         assert isinstance(healthy.healthy, MixedModel)
         print("\nnote: ".join([healthy.healthy.checked, *refused]))
         return 0
-    written: list[str] = []
-    if arguments.write_model:
-        found, written = write_model(found, vehicle, arguments.write_model)
+    written = write_model(found, vehicle, arguments.write_model) if arguments.write_model else []
     if arguments.json:
         write_json(arguments.json, None, found.report)
     if arguments.report:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,18 +49,18 @@ def term({arguments}, *, {name}_scale):
 '''
 
 
-def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discovery, list[str]]:
+def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> list[str]:
     """Write `vehicle` extended by the causes, or by a curve for a difference without a name, to `out`.
 
-    Gives the discovery with the file in its report, and sentences on the changes; no file is written without anything
-    to add. The statistics of healthy rides go along. Effects that are not the package's are copied into a folder next
-    to the file. A cause that the vehicle file alone does not know is part of its ``[forecast] factor``, measured over
-    modelled energy, and leaves it; a change since healthy rides is not. Raises InputError.
+    Gives sentences on the changes; no file is written without anything to add. The statistics of healthy rides go
+    along. Effects that are not the package's are copied into a folder next to the file. A cause that the vehicle file
+    alone does not know is part of its ``[forecast] factor``, measured over modelled energy, and leaves it; a change
+    since healthy rides is not. Raises InputError.
     """
     report, base, mixed = found.report, vehicle.file, found.search.mixed
     causes, unknown = [cause for cause in report.causes if not cause.varies], report.unknown
     if not causes and unknown is None:
-        return found, ["not written: there is nothing to extend it with"]
+        return ["not written: there is nothing to extend it with"]
     parameters, added = extension(found, causes)
     words = [f"{name} = {f.value:.4g} ± {with_unit(f.sd, f.unit, '.2g')}" for name, f in parameters.items()]
     folder, effects = out.with_name(f"{out.stem}_effects"), (*vehicle.model.effects, *added)
@@ -74,7 +73,7 @@ def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discover
             words.append(f"an empirical effect, {folder.name}/{curve[0]}.py")
             names.append(curve[0])
     if not parameters and curve is None:
-        return found, ["not written", *words]
+        return ["not written", *words]
     with writing(f"--write-model {out}"):
         keys = copied_effects(effects, out)
         keys["model", "effects"] = names
@@ -94,7 +93,7 @@ def write_model(found: Discovery, vehicle: Vehicle, out: Path) -> tuple[Discover
         write_vehicle(base, [Result("discover", parameters=parameters)], out, maker, keys)
     if report.ambiguous:
         words.append("of causes that cannot be told apart it has the likeliest, which other rides may refute")
-    return replace(found, report=replace(report, extended_model=str(out))), [str(out), *words]
+    return [str(out), *words]
 
 
 def extension(found: Discovery, causes: list[FoundCause]) -> tuple[dict[str, Found], list[Effect]]:

@@ -39,7 +39,7 @@ from gz_onboard.discovery.search import (
 from gz_onboard.errors import brief
 from gz_onboard.reports.results import OPTIONAL
 
-VERSION = 3  # of the keys
+VERSION = 4  # of the keys
 VERDICTS = {
     "cause": "Fault identified",
     "none": "No fault found that these rides could show",
@@ -54,7 +54,6 @@ METRICS = {
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }
 """Of the gain: label, factor and unit."""
-RIDE_TO_RIDE = "ride"  # the quantity of an error that differs from ride to ride
 POWER_CHANNELS = ("road_force", "inverter_power", "pack_power", "auxiliary", "pack_balance")
 """Channels whose residual is a power at the terminals of the pack."""
 LUMPED = dict.fromkeys(("motor_temperature", "inverter_temperature", "cell_temperature"), 3) | dict.fromkeys(
@@ -84,10 +83,10 @@ class JudgementConfig:
     better: float = 15.0  # of chi-squared, less 2 for each further knot, by which a curve beats a cause
     far_beyond: float = 10.0  # times the threshold: the score of an impossible candidate that is no chance
     most_refitted: float = 0.25  # of the energy: healthy rides refit a tenth against the file alone
+    least_refitted: float = 0.02  # of the energy, for one parameter to be named
     bootstrap: int = 400  # draws over rides
     missed: float = 0.05  # of the range or the energy
     healthy_most: float = 0.08  # of it: of 40 healthy sets none misses more than 5.4 %, against its file 7.1 %
-    other_radius: float = 1.1  # no tyre changes its radius by as much
     outstanding: float = 3.5  # standard deviations of a ride from healthy ones
 
 
@@ -128,7 +127,7 @@ class FoundCause:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A difference without a name: a curve that a `channel` leaves over a `quantity`, `RIDE_TO_RIDE` or a `CONSTANT`.
+    """A difference without a name: a curve that a `channel` leaves over a `quantity`, or a `CONSTANT`.
 
     straight: in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it refutes.
     share: of the energy.
@@ -152,61 +151,18 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class Impossible:
-    """A candidate whose evidence asks for a value of its first parameter beyond its bounds, and the energy it takes."""
+class Implausible:
+    """An explanation of the rides that is hard to believe: the `value` that a parameter would need, and why."""
 
-    name: str
     parameter: str
     value: float
     unit: str
-    bounds: Interval
-    score: float
     energy_share: float
+    why: str
 
     def __str__(self) -> str:
-        return (
-            f"{self.name} (score {self.score:.0f}, {self.energy_share:+.1%} of the energy) would explain the rides "
-            f"with {self.parameter} = {with_unit(self.value, self.unit)}, beyond its bounds of {self.bounds[0]:g} to "
-            f"{self.bounds[1]:g}"
-        )
-
-
-@dataclass(frozen=True)
-class Refitted:
-    """A parameter without a cause, before the rides and refitted to them. stated: not missing in the vehicle file."""
-
-    parameter: str
-    known: float
-    value: float
-    unit: str
-    energy_share: float
-    stated: bool
-
-    def __str__(self) -> str:
-        missing = "" if self.stated else " (not in the vehicle file)"
         value = with_unit(self.value, self.unit)
-        return f"{self.parameter} {self.known:.4g} to {value}, {self.energy_share:+.1%}{missing}"
-
-
-@dataclass(frozen=True)
-class Strain:
-    """Implausible explanations of the rides: parameters without a cause whose refit takes a large `energy_share`, and
-    candidates at impossible values.
-    """
-
-    energy_share: float
-    refitted: tuple[Refitted, ...]
-    impossible: tuple[Impossible, ...]
-
-    def sentences(self) -> list[str]:
-        """One sentence for each."""
-        found = [str(row) for row in self.impossible]
-        if self.refitted:
-            found.append(
-                f"parameters without a cause took {self.energy_share:+.1%} of the energy in the refit, which is "
-                f"implausible: {'; '.join(map(str, self.refitted))}"
-            )
-        return found
+        return f"{self.parameter} = {value} ({self.energy_share:+.1%} of the energy): {self.why}"
 
 
 @dataclass(frozen=True)
@@ -312,7 +268,6 @@ class Report:
         "on rides held out: holdout, and per metric before, control (present parameters refitted), after, ci95 (of "
         "control minus after, over rides); apart: whether these rides had no part in the choice either",
     ]
-    extended_model: Annotated[str | None, "the vehicle file written, or null"] = field(default=None)
     advice: Annotated[list[str], "what to ride next"] = field(default_factory=list)
     notes: Annotated[list[str], "unusable rides, causes left out, outliers, missing sensors"] = field(
         default_factory=list
@@ -327,11 +282,11 @@ class Report:
         "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves of the "
         "quantity over the mean), chi2",
     ] = field(default_factory=list)
-    strain: Annotated[
-        Strain | None,
-        "implausible explanations: energy_share of all that was refitted, refitted (the parameters that took most), "
-        "impossible (candidates at values beyond their bounds); or null",
-    ] = None
+    implausible: Annotated[
+        list[Implausible],
+        "parameters that explain the rides away: parameter, value, unit, energy_share, why (a candidate beyond its "
+        "bounds, or a refit without a cause that takes much of the energy)",
+    ] = field(default_factory=list)
     limits: Annotated[
         dict[str, Limit],
         "per candidate: parameter, change, unit, energy_share: the least that would be found half the time; needs: the "
@@ -444,12 +399,9 @@ def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
     best = best_curve(now)
     if best is None or not best.denies:
         best = rival_curve(now) or best
-    uneven = [split for split in constancy if split.unequal]
+    uneven = [split for split in constancy if split.unequal and not split.of_ride]
     if uneven and (best is None or not best.denies):
-        worst = max(uneven, key=lambda split: split.chi2)
-        best = curve_over_split(now, worst)
-        if best is None and any(split.of_ride and split.cause == worst.cause for split in constancy):
-            best = ride_to_ride(now, worst, constancy)
+        best = curve_over_split(now, max(uneven, key=lambda split: split.chi2)) or best
     if best is None or not best.denies:
         return best
     denied = dict.fromkeys([*best.denies, *(split.cause for split in uneven)])
@@ -522,15 +474,6 @@ def curve_over_split(now: Search, split: Split) -> Unknown | None:
     return None if found is None else described(now, found, [split.cause])
 
 
-def ride_to_ride(now: Search, worst: Split, constancy: Sequence[Split]) -> Unknown:
-    """A cause that acts in some rides and not in others: how much more or less in each."""
-    channel = max((name for line in now.lines for name in line.tables), key=lambda name: channel_effect(now, name)[1])
-    mine = [split for split in constancy if split.cause == worst.cause and split.of_ride]
-    rows = tuple((float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5) for i, s in enumerate(mine))
-    share = energy_share(now.lines, now.change)
-    return Unknown(channel, RIDE_TO_RIDE, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
-
-
 def described(now: Search, curve: CurveFit, denies: Sequence[str]) -> Unknown:
     """The curve for the report."""
     form = curve.form
@@ -576,41 +519,45 @@ def channel_effect(now: Search, channel: str) -> tuple[float, float]:
     return float(np.sqrt(np.mean(acting**2))), here / everywhere
 
 
-def strain_of(now: Search, chosen: Sequence[str], scores: Mapping[str, float]) -> Strain | None:
-    """Implausible explanations next to the causes `chosen`, with `scores` of each candidate; None if there are none.
+def implausible_explanations(now: Search, chosen: Sequence[str], scores: Mapping[str, float]) -> list[Implausible]:
+    """What explains rides away next to the causes `chosen`: vehicle, its file or a signal is then wrong.
 
-    Two things explain rides away without a cause: a candidate whose evidence asks for a value that it cannot have is
-    not named, and parameters without a cause move in each fit, perhaps each within its prior, and yet together they
-    may take most of the energy. Then the vehicle, its file or a signal is wrong.
+    A candidate whose evidence asks for a value that it cannot have is not named. And parameters without a cause move in
+    each fit, perhaps each within its prior, but together they may take most of the energy. scores: of each candidate.
     """
     mixed = now.mixed
-    impossible = []
+    found = []
     for row in now.rejected:
         if row.why != IMPOSSIBLE or scores[row.name] <= JUDGE.far_beyond * now.limit:
             continue
         (cause,) = (cause for cause in mixed.causes if cause.name == row.name)
-        index, whole, first = mixed.index(cause.names), np.zeros(len(mixed.names)), cause.parameters[0]
-        whole[index] = row.change
-        value = stepped(first.name, mixed.values[first.name], float(whole[index[0]] * mixed.scale[index[0]]))
-        bounds, share = (first.low, first.high), energy_share(now.lines, whole)
-        impossible.append(Impossible(cause.name, first.name, value, first.unit, bounds, scores[row.name], share))
-    # of all parameters but those of causes, sensors and the start
+        index, first = mixed.index(cause.names), cause.parameters[0]
+        change = np.zeros(len(mixed.names))
+        change[index] = row.change
+        value = mixed.values_at(change)[first.name]
+        why = f"{row.name} (score {scores[row.name]:.0f}) is possible from {first.low:g} to {first.high:g} only"
+        found.append(Implausible(first.name, value, first.unit, energy_share(now.lines, change), why))
     causes, post = fitted(now, chosen)
     drawn = sum(line.ride.energy for line in now.lines) or 1.0
-    moves = [post.mean + own - mixed.mean for own in post.own]
-    shares = np.sum([energy_per_change(x) * move for x, move in zip(now.lines, moves, strict=True)], axis=0) / drawn
-    judged = [i for i, name in enumerate(mixed.names) if i not in causes and name not in EACH_RIDES_OWN]
-    total = float(np.sum(shares[judged]))
-    if abs(total) <= JUDGE.most_refitted:
-        return Strain(total, (), tuple(impossible)) if impossible else None
-    known, before, rows = mixed.vehicle.parameters.known, mixed.values_at(mixed.mean), []
-    for i in sorted(judged, key=lambda i: -abs(shares[i]))[:4]:
-        name = mixed.names[i]
+    shares = np.zeros(len(mixed.names))
+    for line, own in zip(now.lines, post.own, strict=True):
+        shares += energy_per_change(line) * (post.mean + own - mixed.mean) / drawn
+    # of all parameters but those of causes, sensors and the start
+    refitted = [i for i, name in enumerate(mixed.names) if i not in causes and name not in EACH_RIDES_OWN]
+    if abs(float(np.sum(shares[refitted]))) <= JUDGE.most_refitted:
+        return found
+    known, before, after = mixed.vehicle.parameters.known, mixed.values_at(mixed.mean), mixed.values_at(post.mean)
+    for i in sorted(refitted, key=lambda i: -abs(shares[i]))[:4]:
+        name, share = mixed.names[i], float(shares[i])
+        if abs(share) < JUDGE.least_refitted:
+            continue
         unit = NUISANCE[name].unit if name in NUISANCE else known[name].unit if name in known else ""
         stated = name in NUISANCE or (name in known and not known[name].source.startswith("prior:"))
-        value = stepped(name, before[name], float((post.mean[i] - mixed.mean[i]) * mixed.scale[i]))
-        rows.append(Refitted(name, before[name], value, unit, float(shares[i]), stated))
-    return Strain(total, tuple(row for row in rows if abs(row.energy_share) > 0.02), tuple(impossible))
+        why = f"refitted from {before[name]:.4g} without a cause" + (
+            "" if stated else "; it is not in the vehicle file"
+        )
+        found.append(Implausible(name, after[name], unit, share, why))
+    return found
 
 
 def fitted(now: Search, causes: Sequence[str]) -> tuple[list[int], Posterior]:
@@ -744,7 +691,7 @@ def measure_gain(
     named = {cause.name for cause in causes if not cause.varies}
     after = [cause for cause in mixed.causes if cause.name in named]
     form = None
-    if unknown is not None and unknown.quantity != RIDE_TO_RIDE:
+    if unknown is not None:
         form = curve_form(unknown.channel, unknown.quantity, unknown.straight, mixed.system.sizes)
     rows: dict[str, list[list[float]]] = {}
     for models in held_out(mixed, lines, after, form=form, folds=folds):
@@ -790,10 +737,12 @@ def judge(
     unknown = unexplained(now, constancy)
     chosen = tuple(name for name in now.chosen if unknown is None or name not in unknown.denies)
     every = replace(now, causes=problem.causes)
-    found = [replace(cause, varies=not carries_over(now, cause.name)) for cause in causes_of(now, chosen)]
+    uneven = {split.cause for split in constancy if split.unequal and split.of_ride}
+    varying = {name for name in chosen if name in uneven or not carries_over(now, name)}
+    found = [replace(cause, varies=cause.name in varying) for cause in causes_of(now, chosen)]
     sets = alternatives(now, chosen)
     scores = {name: every.part(chosen, name) for name in every.causes}
-    notes = [*notes, *unseen(problem), *map(str, now.rejected)]
+    notes = [*notes, *not_identifiable(problem), *map(str, now.rejected)]
     if now.winds is not None:
         name = now.winds.cause.name
         scores[name] = max(scores.get(name, 0.0), now.winds.score)
@@ -809,10 +758,10 @@ def judge(
         if without is not None and with_it is not None and without.after <= with_it.after:
             notes.append(f"{unknown} does not improve rides held out: left out")
             unknown, gain = None, plain
-    strain = strain_of(now, chosen, scores)
+    implausible = implausible_explanations(now, chosen, scores)
     what, missed = remaining_error(gain, now.lines)
     verdict = "ambiguous" if sets else "cause" if found else "none"
-    if not found and (unknown is not None or strain is not None):
+    if not found and (unknown is not None or implausible):
         verdict = "unknown"
     if verdict == "none" and missed > JUDGE.healthy_most:
         verdict = "inconclusive"
@@ -828,35 +777,31 @@ def judge(
         ranking=ranking,
         residuals=residual_sizes(now.lines),
         gain=gain,
-        advice=advice(now, sets, unknown, strain, verdict),
-        notes=[*notes, *outlying_rides(now, found), *implausible_rides(now.lines), *missing_residuals(now)],
+        advice=advice(now, sets, unknown, bool(implausible), verdict),
+        notes=[*notes, *outlying_rides(now, found), *missing_residuals(now)],
         isolability=separability(every),
         threshold=now.limit,
         constancy=constancy,
-        strain=strain,
+        implausible=implausible,
         limits=limits(now, [row.name for row in ranking]),
     )
     return Discovery(report, now)
 
 
 def advice(
-    now: Search, sets: Sequence[Sequence[str]], unknown: Unknown | None, strain: Strain | None, verdict: str
+    now: Search, sets: Sequence[Sequence[str]], unknown: Unknown | None, implausible: bool, verdict: str
 ) -> list[str]:
     """What to ride next."""
     lines = []
-    if strain is not None:
-        guessed = ", ".join(row.parameter for row in strain.refitted if not row.stated)
+    if implausible:
         lines.append(
-            (f"State the parameters that the file leaves open ({guessed}). " if guessed else "")
-            + "Vehicle, vehicle file or a signal: these rides cannot tell which is wrong. A wrong unit, sign or scale "
-            "is found by `gz-onboard vehicle check`."
+            "Vehicle, vehicle file or a signal: these rides cannot tell which is wrong. State the parameters that the "
+            "file leaves open; a wrong unit, sign or scale is found by `gz-onboard vehicle check`."
         )
     for group in sets:
         shown = " ".join(now.causes[name].shown_by for name in group[:2])
         lines.append(f"To tell {', '.join(group)} apart: {shown}")
-    if unknown is not None and unknown.quantity == RIDE_TO_RIDE:
-        lines.append(f"Ride one and the same way several times: the {readable(unknown.channel)} differs between rides.")
-    elif unknown is not None and unknown.quantity == CONSTANT:
+    if unknown is not None and unknown.quantity == CONSTANT:
         lines.append(
             f"Stand with the vehicle switched on, and ride at several steady speeds, for minutes each: a constant "
             f"{unknown.channel} is one at all of them. A current sensor whose zero is off would show one too."
@@ -877,16 +822,13 @@ def advice(
 # --- notes ----------------------------------------------------------------------------------------------------------
 
 
-def unseen(problem: Search) -> list[str]:
-    """A note on the candidates that are not identifiable, and one on each that no ride has the sensors for."""
-    mixed = problem.mixed
-    blind = [cause for cause in mixed.causes if cause.name not in problem.causes]
-    there = {name for line in problem.lines for name in line.tables}
-    lacking = [cause for cause in blind if not there & {channel.name for channel in showing(mixed, cause)}]
-    notes = [f"{c.name} was not looked for: it needs {', or '.join(needs(mixed, c)) or 'a battery'}" for c in lacking]
-    rest = [cause.name for cause in blind if cause not in lacking]
-    verb = "is" if len(rest) == 1 else "are"
-    return [*([f"{', '.join(rest)} {verb} not identifiable from these rides"] if rest else []), *notes]
+def not_identifiable(problem: Search) -> list[str]:
+    """A note on the candidates that these rides do not show."""
+    names = [cause.name for cause in problem.mixed.causes if cause.name not in problem.causes]
+    if not names:
+        return []
+    text = f"not identifiable from these rides: {', '.join(names)}; the report gives the data that each needs"
+    return [text]
 
 
 def outlying_rides(now: Search, causes: Sequence[FoundCause]) -> list[str]:
@@ -901,22 +843,6 @@ def outlying_rides(now: Search, causes: Sequence[FoundCause]) -> list[str]:
             most = ", ".join(f"{readable(now.mixed.names[i])} {beyond[i]:+.1f}" for i in far[:3])
             sentences.append(f"{line.ride.name} is an outlier: {most} standard deviations")
     return sentences
-
-
-def implausible_rides(lines: Sequence[LinearRide]) -> list[str]:
-    """A sentence on each ride whose GPS speed contradicts that of the motor: it may be another vehicle's."""
-    found = []
-    for line in lines:
-        s, speed = line.ride.signals, np.abs(line.ride.quantities["speed"])
-        if "gps_speed" not in s or not np.any(moving := speed > 5.0):
-            continue
-        ratio = float(np.median(s["gps_speed"][moving] / speed[moving]))
-        if not 1 / JUDGE.other_radius < ratio < JUDGE.other_radius:
-            found.append(
-                f"{line.ride.name}: GPS speed is {ratio:.2f} times the speed by motor speed and wheel radius; is this "
-                "a ride of this vehicle?"
-            )
-    return found
 
 
 def missing_residuals(now: Search) -> list[str]:

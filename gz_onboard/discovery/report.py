@@ -14,7 +14,6 @@ from gz_onboard.arrays import Array
 from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.judgement import (
     METRICS,
-    RIDE_TO_RIDE,
     VERDICTS,
     Discovery,
     FoundCause,
@@ -194,7 +193,7 @@ def _findings(report: Report) -> list[tuple[str, str]]:
         found.append(("unexplained", f"{u}, {u.share:+.1%} of the energy, score {u.score:.0f}"))
         if u.denies:
             found.append(("rejected", f"{', '.join(u.denies)}, which would not act alike everywhere"))
-    return found + [("implausible", text) for text in (report.strain.sentences() if report.strain else ())]
+    return found + [("implausible", str(row)) for row in report.implausible]
 
 
 def _cause_lines(report: Report) -> list[str]:
@@ -474,8 +473,5 @@ def curve(unknown: Unknown) -> Figure:
     axis.set_ylim(min(low, 0.0) * 1.1, max(high, 0.0) * 1.1 + 1e-9)
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{readable(unknown.quantity)} [{unknown.unit}]", fontsize=9, color=INK)
-    left = f"{readable(unknown.channel)} [{CHANNEL[unknown.channel].unit}]"
-    if unknown.quantity == RIDE_TO_RIDE:
-        left = f"{readable(unknown.denies[0])}, over its mean [1]"
-    axis.set_ylabel(left, fontsize=9, color=INK)
+    axis.set_ylabel(f"{readable(unknown.channel)} [{CHANNEL[unknown.channel].unit}]", fontsize=9, color=INK)
     return figure
