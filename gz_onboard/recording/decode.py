@@ -121,7 +121,11 @@ class DecodedLog:
         self._origin_ns = codec.origin_ns
 
     def samples(self) -> dict[str, Column]:
-        """(times [s], values in SI units) by role, in the order of the frames."""
+        """(times [s], values in SI units) by role, in the order of the frames.
+
+        A frame whose time is a little before that of an earlier one, as from two channels, has the time of that one:
+        times never decrease.
+        """
         found: dict[str, Column] = {}
         for message in self._decoded:
             time = message.time_ns.astype(float) * 1e-9
@@ -133,7 +137,8 @@ class DecodedLog:
         for counts, key, _, numbers in self._events:
             counts[key] = counts.get(key, 0) + int(numbers.sum())
         self.see_latest(len(self._time_ns))
-        return {role: found[role] for group in self.codec.groups for role in group.roles if role in found}
+        roles = [role for group in self.codec.groups for role in group.roles if role in found]
+        return {role: (np.maximum.accumulate(found[role][0]), found[role][1]) for role in roles}
 
     def steps(self) -> Iterator[LogWindow]:
         """The windows of the live pipeline; with each the codec has counted what it would have counted until then.

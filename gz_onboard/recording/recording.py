@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from gz_onboard.arguments import check, within
-from gz_onboard.can.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
+from gz_onboard.can.codec import LONGEST_PAUSE_NS, TIME, Codec
 from gz_onboard.can.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, hexadecimal
@@ -40,7 +40,7 @@ class Recording:
     """One ride as measured.
 
     columns: by role (names and units of `events.ROLES`, and `events.INSTRUMENTS`) the times [s, of one clock for the
-    whole ride, increasing] and values (SI) of every sample that passed the codec, no two roles at the same times.
+    whole ride, never decreasing] and values (SI) of every sample that passed the codec, no two roles at the same times.
     facts: what was written down about the ride: of `NUMBERS` and `TEXTS`.
 
     Raises InputError for what is none of these.
@@ -187,7 +187,7 @@ def checked_facts(place: str, facts: object) -> dict[str, object]:
 
 
 def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
-    """(times, values) of a role; InputError if these are not two arrays of numbers of one length, times increasing."""
+    """(times, values) of a role; InputError if these are not two arrays of numbers of one length, or times decrease."""
     import numpy as np
 
     if role not in ROLES and role not in INSTRUMENTS:
@@ -200,8 +200,8 @@ def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
         time, values = np.zeros(1), np.zeros(2)
     if time.shape != values.shape or time.ndim != 1 or not {time.dtype.kind, values.dtype.kind} <= set("fiu"):
         raise InputError(f"{place}: must be two arrays of numbers of one length, times [s] and values")
-    if not (np.diff(time) >= -1e-9 * BACK_NS).all():
-        raise InputError(f"{place}: its times do not increase")
+    if not (np.diff(time) >= 0).all():
+        raise InputError(f"{place}: its times decrease")
     return time.astype(float, copy=False), values.astype(float, copy=False)
 
 

@@ -31,12 +31,13 @@ LEFT = (*COUNTED, "wrong_lengths", "origin_ns", "last_ns")
 
 
 def live(frames: Sequence[Frame], codec: Codec) -> dict[str, list[tuple[float, float]]]:
-    """(time [s], value) by role, of the live codec."""
+    """(time [s], value) by role, of the live codec; the columns' times never decrease."""
     found: dict[str, list[tuple[float, float]]] = {}
     for time, group, values in events_of(codec, frames):
         for role, value in zip(codec.groups[group].roles, values, strict=True):
             if value is not None:
-                found.setdefault(role, []).append((time, value))
+                samples = found.setdefault(role, [])
+                samples.append((max(time, samples[-1][0]) if samples else time, value))
     return found
 
 
