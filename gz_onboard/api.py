@@ -39,7 +39,7 @@ from gz_onboard.estimation.saved_state import held, text_of
 from gz_onboard.estimation.summary import RideSummary
 from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.events import Frame
-from gz_onboard.export.contents import FRAME, ExportSource, frame_columns
+from gz_onboard.export.contents import FRAME, ExportSource, LoggedMessage, LoggedSignals, frame_columns
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC
 from gz_onboard.options import LONGEST_LOG, MOST_PAYLOAD
 from gz_onboard.progress import Progress
@@ -49,7 +49,7 @@ from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.recording import Recording, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable, table_of
 from gz_onboard.reports.results import descriptions, distinct_names
-from gz_onboard.reports.tables import Columns, Tabular, array_of, columns_of, table_columns
+from gz_onboard.reports.tables import Columns, Tabular, array_of, columns_of, table_columns, time_array
 from gz_onboard.routes.route import read_route
 from gz_onboard.simulation.output import series_table
 from gz_onboard.simulation.plan import SimulationOptions, find_plan, vehicle_on
@@ -204,7 +204,7 @@ class LoggedEstimates(Tabular):
 
     def to_table(self) -> Columns:
         """Return a row for each estimate, with the columns that ``gz-onboard export --estimates`` writes."""
-        return {"time": _times(self.times), **columns_of(self.rows, self.columns)}
+        return {"time": time_array(self.times), **columns_of(self.rows, self.columns)}
 
 
 @dataclass(frozen=True)
@@ -292,52 +292,7 @@ class LoggedFrames(Tabular):
         columns = frame_columns(FrameColumns.of(self.frames))
         kinds: dict[type, Any] = {int: np.int64, bool: bool, str: object}
         arrays = {name: np.array(column, kinds[FRAME[name]]) for name, column in columns.items()}
-        return {"time": _times([frame[0] for frame in self.frames]), **arrays}
-
-
-@dataclass(frozen=True)
-class LoggedMessage(Tabular):
-    """The signals of one message. times: [ns since the epoch]; columns: as long, by name and unit."""
-
-    times: Sequence[int]
-    columns: Columns
-
-    __repr__ = brief
-
-    def to_table(self) -> Columns:
-        """Return a row for each frame, as in a folder of tables that ``gz-onboard export`` writes."""
-        return {"time": _times(self.times), **self.columns}
-
-
-@dataclass(frozen=True)
-class LoggedSignals(Tabular):
-    """The signals in a log, by message. damages: what of the log could not be read.
-
-    unknown: frames that are in no DBC file; undecodable: that do not fit theirs; conflicts: messages that come from
-    two channels or senders with different data, of which the first is here.
-    """
-
-    messages: Mapping[str, LoggedMessage]
-    damages: Sequence[LogDamage]
-    unknown: int = 0
-    undecodable: int = 0
-    conflicts: Sequence[str] = ()
-
-    __repr__ = brief
-
-    def to_table(self) -> Columns:
-        """Return a row for each value: time, message, signal, value; message by message. Texts are nan."""
-        numbers = [
-            np.column_stack([c if c.dtype.kind in "bf" else np.full(len(c), np.nan) for c in one.columns.values()])
-            for one in self.messages.values()
-        ]
-        named = list(zip(self.messages.items(), numbers, strict=True))
-        return {
-            "time": np.concatenate([_times([]), *(np.repeat(_times(m.times), x.shape[1]) for (_, m), x in named)]),
-            "message": np.array([name for (name, _), x in named for _ in range(x.size)], dtype=object),
-            "signal": np.array([c for (_, m), x in named for _ in range(len(x)) for c in m.columns], dtype=object),
-            "value": np.concatenate([np.empty(0), *(x.ravel() for x in numbers)]),
-        }
+        return {"time": time_array([frame[0] for frame in self.frames]), **arrays}
 
 
 @checked
@@ -365,15 +320,7 @@ def read_signals(
     if dbc and vehicle is not None:
         raise InputError("dbc: a vehicle has DBC files of its own; give one of the two")
     source = _part(log, start, end, columns)
-    found = source.signals(_paths(dbc), None if vehicle is None else _vehicle(vehicle))
-    messages = {
-        name: LoggedMessage(rows.times, {column: array_of(values) for column, values in rows.columns.items()})
-        for name, rows in found.messages.items()
-    }
-    if (decoder := found.decoder) is None:
-        return LoggedSignals(messages, source.damages)
-    conflicts = tuple(decoder.origins.conflicts.values())
-    return LoggedSignals(messages, source.damages, decoder.unknown, decoder.undecodable, conflicts)
+    return source.signals(_paths(dbc), None if vehicle is None else _vehicle(vehicle))
 
 
 def _part(log: PathLike, start: float, end: float | None, columns: Sequence[str] | None = None) -> ExportSource:
@@ -381,10 +328,6 @@ def _part(log: PathLike, start: float, end: float | None, columns: Sequence[str]
     if end is not None and not end > start:
         raise InputError(f"end {end:g} s: must be after start {start:g} s")
     return ExportSource(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
-
-
-def _times(times: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.datetime64]]:
-    return np.array(times, dtype="datetime64[ns]")
 
 
 # --- learned --------------------------------------------------------------------------------------------------------

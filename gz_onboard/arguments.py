@@ -9,11 +9,11 @@ import collections.abc
 import functools
 import inspect
 import os
+import re
 import types
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from gz_onboard.errors import InputError, naming, nearest, shown
@@ -23,16 +23,7 @@ R = TypeVar("R")
 Ranges = Mapping[str, tuple[float, float, str]]
 """By name of what is a number: the least, the greatest, the unit."""
 
-_WORDS: dict[object, str] = {
-    float: "a number",
-    int: "a whole number",
-    bool: "True or False",
-    str: "a text",
-    Path: "a path",
-    os.PathLike: "a path",
-    collections.abc.Callable: "a function",
-    types.NoneType: "None",
-}
+_WORDS: dict[object, str] = {float: "a number", int: "a whole number", bool: "True or False", str: "a text"}
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -78,7 +69,8 @@ def check(name: str, value: object, hint: Any) -> None:
     if fits(value, hint):
         return
     known = [part for part in get_args(hint) if isinstance(part, str)] if get_origin(hint) is Literal else []
-    raise InputError(f"{name} {shown(value)}: must be {_words(hint)}{nearest(str(value), known)}")
+    expected = " or ".join(known) or _WORDS.get(hint) or re.sub(r"[\w.]+\.", "", inspect.formatannotation(hint))
+    raise InputError(f"{name} {shown(value)}: must be {expected}{nearest(str(value), known)}")
 
 
 def fits(value: object, hint: Any) -> bool:
@@ -117,22 +109,3 @@ def _possible(name: str) -> bool:
         return b"\0" not in os.fsencode(name)
     except UnicodeEncodeError:
         return False
-
-
-def _words(hint: Any) -> str:
-    """What a type hint says, for a person."""
-    kind, parts = get_origin(hint) or hint, get_args(hint)
-    if kind in (Union, types.UnionType):
-        *most, last = dict.fromkeys(map(_words, parts))
-        return f"{', '.join(most)} or {last}" if most else last
-    if kind is Literal:
-        return " or ".join(parts)
-    if kind in _WORDS:
-        return _WORDS[kind]
-    if kind in (Any, object):
-        return "anything"
-    if isinstance(kind, type) and issubclass(kind, Mapping):
-        return f"a mapping (each {_words(parts[1])})"
-    if parts:
-        return f"a list (each {_words(parts[0])})"
-    return str(getattr(kind, "__name__", kind))

@@ -25,6 +25,8 @@ FAR = 4.0  # standard deviations between file and rides, beyond which they contr
 
 def correlations(vehicle: Vehicle) -> dict[frozenset[str], float]:
     """The correlations in the file of `vehicle`, by the pair of names; InputError for impossible ones."""
+    import numpy as np
+
     found: dict[frozenset[str], float] = {}
     known, every = vehicle.parameters, vehicle.correlations  # of a calibration under way, not of its base file
     for group in every.values:
@@ -48,23 +50,9 @@ def correlations(vehicle: Vehicle) -> dict[frozenset[str], float]:
                     raise table.error(f"the diagonal must be 1, is {r:g}", "value")
                 if i != j:
                     found[frozenset((names[i], names[j]))] = r
-        if not _is_positive(rows):
+        if np.linalg.eigvalsh(rows)[0] < -0.01:  # by more than the rounding to two digits
             raise table.error("no parameters can have these correlations together: a variance is negative", "value")
     return found
-
-
-def _is_positive(rows: Sequence[Sequence[float]]) -> bool:
-    """Whether a symmetric matrix has no negative variance, except by rounding: all pivots of Gaussian elimination."""
-    while rows:
-        (pivot, *row), *others = rows
-        follows = pivot < 1e-6  # the parameter follows from those before it: its remainder must be rounding
-        if pivot < -1e-4 or (follows and any(abs(x) > 1e-2 for x in row)):
-            return False
-        rows = [
-            [x - (0.0 if follows else a * b / pivot) for x, b in zip(other[1:], row, strict=True)]
-            for a, other in zip(row, others, strict=True)
-        ]
-    return True
 
 
 @dataclass(frozen=True)

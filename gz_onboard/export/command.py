@@ -176,14 +176,14 @@ def _signals(arguments: argparse.Namespace, source: ExportSource, part: Path, ki
         if source.columns is not None:
             raise InputError("--columns: an .mcap has all that is in the log")
         text = f"{write_mcap(source.log, part, decoder, frames.batches(), source.section)} samples"
+        unknown, undecodable, conflicts = decoder.unknown, decoder.undecodable, decoder.conflicts
     elif not kind.startswith("/") and kind not in _TABLES:
         raise InputError(f"{source.log}: its signals can be written to .csv, .parquet, .jsonl, .mcap or a directory")
     else:
         found = source.signals(files, vehicle)
         count = write_signals(found, part, kind)
-        if found.decoder is None:
+        if not found.is_decoded:
             return f"{count} rows of signals, as they were logged once a second"
-        text, decoder = f"{count} frames", found.decoder
-    counts = f"{decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
-    doubts = [f"only the first is written: {conflict}" for conflict in decoder.origins.conflicts.values()]
-    return "; ".join([text, counts, *doubts])
+        text, unknown, undecodable, conflicts = f"{count} frames", found.unknown, found.undecodable, found.conflicts
+    counts = f"{unknown} frames are in no DBC file, {undecodable} do not fit theirs"
+    return "; ".join([text, counts, *(f"only the first is written: {conflict}" for conflict in conflicts)])

@@ -16,16 +16,26 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.can.codec import BACK_NS
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, brief, nearest
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED
-from gz_onboard.export.decoder import Decoder, decoder_of
+from gz_onboard.export.decoder import decoder_of
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC
 from gz_onboard.recording import logs
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.replay import log_section
 from gz_onboard.reports.results import clock, text_rows
-from gz_onboard.reports.tables import json_line, open_text, table_columns, table_suffix, write_table
+from gz_onboard.reports.tables import (
+    Columns,
+    Tabular,
+    array_of,
+    json_line,
+    open_text,
+    table_columns,
+    table_suffix,
+    time_array,
+    write_table,
+)
 from gz_onboard.vehicle import Vehicle
 
 ESTIMATES = {"estimate": ESTIMATE_TOPIC, "why": WHY_TOPIC, "range_change": CHANGE_TOPIC}
@@ -42,19 +52,57 @@ Row = tuple[int, dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class MessageRows:
-    """The signals of one message. times: [ns since the epoch]; columns: as long, by name and unit."""
+class LoggedMessage(Tabular):
+    """The signals of one message. times: [ns since the epoch]; columns: as long, by name and unit, None if unknown."""
 
     times: list[int] = field(default_factory=list)
     columns: dict[str, list[Any]] = field(default_factory=dict)
 
+    __repr__ = brief
+
+    def to_table(self) -> Columns:
+        """Return a row for each frame, as in a folder of tables that ``gz-onboard export`` writes."""
+        return {"time": time_array(self.times), **{name: array_of(column) for name, column in self.columns.items()}}
+
 
 @dataclass(frozen=True)
-class LogSignals:
-    """The signals of a log. decoder: with its counts; None if the log holds them decoded, once a second."""
+class LoggedSignals(Tabular):
+    """The signals in a log, by message. damages: what of the log could not be read.
 
-    messages: dict[str, MessageRows]
-    decoder: Decoder | None
+    is_decoded: whether frames were decoded, or the log held the signals, once a second. unknown: frames that are in no
+    DBC file; undecodable: that do not fit theirs; conflicts: messages that come from two channels or senders with
+    different data, of which the first is here.
+    """
+
+    messages: Mapping[str, LoggedMessage]
+    damages: Sequence[LogDamage]
+    is_decoded: bool = False
+    unknown: int = 0
+    undecodable: int = 0
+    conflicts: Sequence[str] = ()
+
+    __repr__ = brief
+
+    def to_table(self) -> Columns:
+        """Return a row for each value: time, message, signal, value; message by message. Texts are nan."""
+        tables: list[Columns] = []
+        for name, message in self.messages.items():
+            columns, count = message.to_table(), len(message.columns)
+            times = columns.pop("time")
+            numbers = [c if c.dtype.kind in "bf" else np.full(len(c), np.nan) for c in columns.values()]
+            tables.append(
+                {
+                    "time": np.repeat(times, count),
+                    "message": np.full(count * len(times), name, dtype=object),
+                    "signal": np.tile(np.array(list(columns), dtype=object), len(times)),
+                    "value": np.column_stack(numbers).astype(float).ravel(),
+                }
+            )
+        empty = {"time": time_array([]), "message": np.empty(0, object), "signal": np.empty(0, object)}
+        return {
+            name: np.concatenate([none, *(table[name] for table in tables)])
+            for name, none in (empty | {"value": np.empty(0)}).items()
+        }
 
 
 @dataclass
@@ -138,9 +186,9 @@ class ExportSource:
                 raise InputError(f"{self.log}: has no column {name!r}{nearest(name, plain)}; there are {there}{more}")
         return {name for name in names if {name, name.partition("[")[0]} & set(self.columns)}
 
-    def signals(self, files: Sequence[Path], vehicle: Vehicle | None) -> LogSignals:
+    def signals(self, files: Sequence[Path], vehicle: Vehicle | None) -> LoggedSignals:
         """Return the signals in the part, decoded as `decoder_of` says. InputError if there are none."""
-        found: dict[str, MessageRows] = {}
+        found: dict[str, LoggedMessage] = {}
         decoder = None
         if not self.has_frames and self.messages:
             known = self._logged_signals(found)
@@ -149,17 +197,19 @@ class ExportSource:
             known = decoder.columns
             for time_ns, message, values in decoder.decode(frames.batches()):
                 if (rows := found.get(message)) is None:
-                    rows = found[message] = MessageRows(columns={name: [] for name in values})
+                    rows = found[message] = LoggedMessage(columns={name: [] for name in values})
                 rows.times.append(time_ns)
                 for column, value in zip(rows.columns.values(), values.values(), strict=True):
                     column.append(value)
         wanted = self.chosen(chain.from_iterable(known.values()))
         if self.columns is not None:
             kept = {m: {name: c for name, c in rows.columns.items() if name in wanted} for m, rows in found.items()}
-            found = {m: MessageRows(found[m].times, columns) for m, columns in kept.items() if columns}
-        return LogSignals(found, decoder)
+            found = {m: LoggedMessage(found[m].times, columns) for m, columns in kept.items() if columns}
+        if decoder is None:
+            return LoggedSignals(found, self.damages)
+        return LoggedSignals(found, self.damages, True, decoder.unknown, decoder.undecodable, decoder.conflicts)
 
-    def _logged_signals(self, found: dict[str, MessageRows]) -> dict[str, list[str]]:
+    def _logged_signals(self, found: dict[str, LoggedMessage]) -> dict[str, list[str]]:
         """Add the signals that a log without frames holds to `found`; return the columns of each message."""
         topics = {message: _MESSAGE + message for message in self.messages}
         columns = {
@@ -169,7 +219,7 @@ class ExportSource:
         for message, topic in topics.items():
             if rows := self.rows(topic, first):
                 values = {c: [v.get(n) for _, v in rows] for n, c in columns[message].items()}
-                found[message] = MessageRows([time_ns for time_ns, _ in rows], values)
+                found[message] = LoggedMessage([time_ns for time_ns, _ in rows], values)
         return {message: list(of.values()) for message, of in columns.items()}
 
     @cached_property
@@ -203,7 +253,7 @@ def write_estimates(source: ExportSource, files: Mapping[str, Path]) -> int:
     return len(estimates)
 
 
-def write_signals(signals: LogSignals, out: Path, suffix: str) -> int:
+def write_signals(signals: LoggedSignals, out: Path, suffix: str) -> int:
     """Write signals as one long table, or a table for each message in the folder `out`; return how many frames.
 
     suffix: of `out`; of a folder, that of its tables with a slash before.
@@ -217,7 +267,7 @@ def write_signals(signals: LogSignals, out: Path, suffix: str) -> int:
     return sum(len(rows.times) for rows in signals.messages.values())
 
 
-def _write_long(out: Path, messages: Mapping[str, MessageRows]) -> None:
+def _write_long(out: Path, messages: Mapping[str, LoggedMessage]) -> None:
     """Write one table, message by message: a row for each value, in .jsonl one for each frame."""
     if table_suffix(out) == ".jsonl":
         with open_text(out) as stream:

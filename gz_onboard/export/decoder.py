@@ -68,6 +68,11 @@ class Decoder:
             yield time_ns, message.name, {column: values.get(signal.name) for column, signal in pairs}
 
     @property
+    def conflicts(self) -> Sequence[str]:
+        """Messages that come from two channels or senders with different data, in words."""
+        return list(self.origins.conflicts.values())
+
+    @property
     def undecodable(self) -> int:
         """Frames of another length than their message, and answers that were dropped."""
         return sum(count for (_, reason), count in self._faults.items() if not reason.startswith(NEGATIVE))

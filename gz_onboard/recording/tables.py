@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
@@ -41,7 +40,6 @@ _MISSING = ("", "nan", "nat", "null", "none", "n/a", "<na>")
 MAX_STEP_S = 30.0  # usual time between rows: beyond it no ride can be followed
 MAX_ROUNDING_S = 1.0  # of times that several rows share: clocks give whole seconds, coarser times were rounded
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_CALENDAR = np.array(["0001-01-01", "9999-12-31"], "datetime64[s]")  # the days that `datetime` has
 
 
 class _Column(NamedTuple):
@@ -156,31 +154,17 @@ def _table(columns: Sequence[tuple[str, object]], name: str) -> SignalTable:
 
 
 def _cells(column: object, name: str, header: str) -> list[Any]:
-    """Return the cells of a column as Python objects. InputError for anything else, and for dates of no calendar."""
-    array = _array(column)
+    """Return the cells of a column as Python objects. Raises InputError for anything else."""
+    kind = getattr(getattr(column, "dtype", None), "kind", "")
+    array = np.array(0)
+    with suppress(TypeError, ValueError):  # of rows of different lengths
+        array = np.asanyarray(column, "M8[us]" if kind == "M" else None)  # or pandas gives `Timestamp`s
     if array.ndim != 1:
         raise InputError(f"{name}: column {header!r}: must be an array of one dimension, is {shown(column)}")
-    if array.dtype.kind == "M":
-        seconds = array.astype("datetime64[s]")
-        beyond = np.flatnonzero((seconds < _CALENDAR[0]) | (seconds > _CALENDAR[1]))
-        if len(beyond):
-            raise InputError(f"{name}:{beyond[0] + 1}: column {header!r}: {array[beyond[0]]} is not a plausible time")
     if array.dtype.kind in "Mm":
         array = array.astype(f"{array.dtype.kind}8[us]")  # as `datetime`, which has no ns
     cells: list[Any] = array.tolist()
     return cells
-
-
-def _array(column: object) -> NDArray[Any]:
-    """Return a column as an array; one of no dimension for anything else."""
-    if isinstance(column, Iterable) and not isinstance(column, str | bytes | Mapping | AbstractSet):
-        kind = getattr(getattr(column, "dtype", None), "kind", "")
-        with suppress(TypeError, ValueError):  # of rows of different lengths
-            if isinstance(column, np.ndarray):
-                return column
-            cells = column if hasattr(column, "__array__") else list(column)
-            return np.asarray(cells, "M8[us]" if kind == "M" else None)  # or pandas gives dates of a zone one by one
-    return np.array(0)
 
 
 # --- as signals -----------------------------------------------------------------------------------------------------

@@ -54,6 +54,11 @@ def array_of(values: Sequence[object]) -> NDArray[Any]:
     return np.array(numbers, dtype=float)
 
 
+def time_array(times: Sequence[int]) -> NDArray[np.datetime64]:
+    """Times [ns since the epoch] as dates."""
+    return np.array(times, dtype="datetime64[ns]")
+
+
 def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
     """Return the column of each field of a row, ``name[unit]``: the unit is the first word of its description.
 

@@ -54,7 +54,6 @@ STAMPS = pd.to_datetime(NS + SINCE_1970 * 10**9)
         pa.array(SECONDS),
         pd.Series(STAMPS.tz_localize("Europe/Berlin")),
         pd.Series(SECONDS, dtype="Float64"),
-        (float(second) for second in SECONDS),
     ],
     ids=lambda time: type(time).__name__,
 )
@@ -115,14 +114,6 @@ def test_a_cell_that_is_none_is_named_with_column_and_row(columns, said):
     for data in (ride(**columns), pd.DataFrame({k: pd.Series(v, dtype=object) for k, v in ride(**columns).items()})):
         with pytest.raises(InputError, match=said):
             currents(data)
-
-
-@pytest.mark.parametrize("whole", [False, True])
-def test_a_time_beyond_all_calendars_is_named(whole):
-    far = pa.array([0, 1, 2, 3, 4, 5, 6, 2**62], pa.timestamp("us"))
-    data = ride(time=far)
-    with pytest.raises(InputError, match=r"table:8: column 'time \[s\]': .* is not a plausible time"):
-        currents(pa.table(data) if whole else data)
 
 
 @pytest.mark.parametrize("column", [set(range(8)), dict.fromkeys(range(8), 14.0), dict.fromkeys(range(8), 1.0).keys()])

@@ -91,7 +91,7 @@ def read(data: Contents, damage: LogDamage) -> FrameColumns:
             tail = b""
             following = data.find(_SIGNATURE, position + 4)
         position = following
-    if tail:
+    if len(tail) > _MOST_PADDING:
         damage.add(f"byte {len(data)}", "the last object is cut off")
     if objects < promised and not damage.count:
         damage.add("in the middle", f"{promised - objects} of {promised} objects are missing")
@@ -131,28 +131,14 @@ def _starts(content: bytes, damage: LogDamage, place: str) -> tuple[NDArray[np.i
     starts = letters[_records(padded, letters, np.dtype("S4")) == _SIGNATURE]
     sizes = _records(padded, starts, _OBJECT)["size"].astype(np.int64)
     ends = starts + sizes
-    gaps = np.append(starts[1:], _LARGEST_CONTAINER) - ends
-    regular = (sizes >= _HEAD.size) & (gaps >= 0) & (gaps <= _MOST_PADDING)  # and so is the one that follows
-    breaks = np.append(np.flatnonzero(~regular), len(starts))
-    found, index, position = [starts[:0]], 0, 0
-    while index < len(starts):
-        if starts[index] > position + _MOST_PADDING:
-            damage.add(place, "no object where one should begin in this container")
-        last = int(breaks[np.searchsorted(breaks, index)])  # of a run of objects that follow each other
-        start, size, end = int(starts[last]), int(sizes[last]), int(ends[last])
-        if start + max(size, _HEAD.size) > len(content):
-            return np.concatenate([*found, starts[index:last]]), content[start:]
-        if size < _HEAD.size:
-            damage.add(place, f"an object of {size} bytes in this container")
-            found.append(starts[index:last])
-            position, index = start + 4, last + 1
-        else:
-            found.append(starts[index : last + 1])
-            position, index = end, int(np.searchsorted(starts, end))
-    rest = content[position:]
-    if len(rest) >= 8:
+    nexts = np.append(starts, len(content))
+    gaps = nexts[np.searchsorted(nexts[:-1], ends)] - ends
+    is_whole = (sizes >= _HEAD.size) & (gaps >= 0) & (gaps <= _MOST_PADDING)  # data may spell the signature too
+    ends = np.append(0, ends[is_whole])
+    begin_of_rest = int(nexts[np.searchsorted(nexts, ends[-1])])
+    if (np.append(starts[is_whole], begin_of_rest) - ends > _MOST_PADDING).any():
         damage.add(place, "no object where one should begin in this container")
-    return np.concatenate(found), rest if len(rest) < 8 else b""
+    return starts[is_whole], content[max(int(ends[-1]), begin_of_rest - _MOST_PADDING) :]
 
 
 def _records(content: bytes, at: NDArray[np.int64], layout: np.dtype[Any]) -> NDArray[Any]:
