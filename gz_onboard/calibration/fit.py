@@ -91,14 +91,10 @@ def linear(
     return _solution(names, value, jacobian, jacobian @ value - y * weight, rows, sd is not None, groups)
 
 
-def line(
-    name: str, x: Array, y: Array, keep: Mask, groups: NDArray[Any] | None = None
-) -> tuple[Solution, Array, Array]:
-    """(slope `name` and ``offset`` of the line through y over x; its y; that of the line through the points `keep`)."""
-    columns = {name: x, "offset": np.ones_like(x)}
-    found = linear(columns, y, groups=groups)
-    part = linear({key: column[keep] for key, column in columns.items()}, y[keep])
-    return found, found[name] * x + found["offset"], part[name] * x + part["offset"]
+def line(name: str, x: Array, y: Array, groups: NDArray[Any] | None = None) -> tuple[Solution, Array]:
+    """(slope `name` and ``offset`` of the line through y over x; its y at x)."""
+    found = linear({name: x, "offset": np.ones_like(x)}, y, groups=groups)
+    return found, found[name] * x + found["offset"]
 
 
 def as_groups(labels: NDArray[Any]) -> NDArray[Any] | None:
@@ -198,11 +194,6 @@ def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:
     keep = np.ones(count, dtype=bool)
     keep[np.random.default_rng(seed).permutation(count)[: round(share * count)]] = False
     return keep
-
-
-def every_second(labels: NDArray[Any]) -> Mask:
-    """True for the points to fit: those with an even label, or as of `split` where all have one label."""
-    return np.asarray(labels % 2 == 0) if len(np.unique(labels)) > 1 else split(len(labels))
 
 
 def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, source: str) -> Fit:

@@ -54,13 +54,15 @@ def voltage_constant(ramp: Measurements) -> Result:
     if np.ptp(speed) < 0.3 * np.max(np.abs(speed)):
         raise ramp.error(f"motor_speed {speed.min():.4g} to {speed.max():.4g} rad/s is too narrow a range for a slope")
     keep = split(len(speed))
-    found, model, outside = line("voltage_constant", speed, emf, keep)
+    found, model = line("voltage_constant", speed, emf)
+    part = line("voltage_constant", speed[keep], emf[keep])[0]
+    outside = part["voltage_constant"] * speed[~keep] + part["offset"]
     if found["voltage_constant"] <= 0:
         raise ramp.error("emf_line falls where motor_speed rises: a sign is wrong")
     result = Result("motor")
     source = f"{name}: {len(speed)} points, {speed.min():.3g} to {speed.max():.3g} rad/s"
     inside = score("back-EMF", "V", emf, model, held_out=False, source=source)
-    held = score("back-EMF", "V", emf[~keep], outside[~keep], held_out=True, source=f"a third of {name}")
+    held = score("back-EMF", "V", emf[~keep], outside, held_out=True, source=f"a third of {name}")
     result.fits += [inside, held]
     source = f"{source}; rms {inside.rms:.3g} V"
     result.parameters["voltage_constant"] = found.found("voltage_constant", "V·s/rad", source)

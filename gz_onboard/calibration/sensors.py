@@ -12,16 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask, block_means, held_at, held_integral
-from gz_onboard.calibration.fit import as_groups, every_second, line, linear, score
-from gz_onboard.calibration.result import Fit, Found, LackingError, Panel, PlotLine, Result, compared
+from gz_onboard.arrays import Array, Mask, block_means, held_integral
+from gz_onboard.calibration.fit import as_groups, line, linear, score
+from gz_onboard.calibration.result import Found, LackingError, Panel, PlotLine, Result, compared
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
-from gz_onboard.model.battery import discharged
-from gz_onboard.model.effect import Port
-from gz_onboard.model.model import standing_load
-from gz_onboard.model.series import first_soc
 from gz_onboard.priors import sizes_of
 from gz_onboard.recording.recording import Recording
 from gz_onboard.recording.sensors import speed_role, true_columns
@@ -66,9 +62,9 @@ class RideConfig:
 
 RIDE = RideConfig()
 TURNING = ("motor_speed", "wheel_speed_rear")  # what turns with the driven wheel, the first that there is
-PAIRED = ["pack_current", "pack_voltage", "inverter_current", "inverter_voltage", "motor_speed", "motor_current"]
-PACK = ("pack_voltage", "pack_current")
-AUXILIARY = ("auxiliary_current", "pack_voltage")
+PACK = {"pack_current", "pack_voltage"}
+PAIRED = PACK | {"inverter_current", "inverter_voltage", "motor_speed", "motor_current"}
+AUXILIARY = {"auxiliary_current", "pack_voltage"}
 LAGS = np.arange(-0.3, 0.31, 0.05)  # s: how far one set of sensors may lag the other
 
 
@@ -76,15 +72,14 @@ LAGS = np.arange(-0.3, 0.31, 0.05)  # s: how far one set of sensors may lag the 
 
 
 def wheel_radius(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
-    """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
+    """wheel_radius [m], the mean over the rides that have GPS and steady riding.
 
     At steady speed the wheel's slip is small and a lag of the receiver does no harm. What slip there is belongs to the
     radius: it is the one that turns motor speed into the vehicle's speed. By motor_speed, of rides without it by
     wheel_speed_rear. Raises LackingError if no ride has both.
     """
     result = Result("wheel")
-    radii: list[float] = []
-    lines, count, turning = [], 0, set()
+    lines, turning = [], set()
     for ride in rides:
         role = next((role for role in TURNING if role in ride.columns), None)
         if "gps_speed" not in ride.columns or role is None:
@@ -100,28 +95,21 @@ def wheel_radius(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
                 "needed"
             )
             continue
-        ratio = over_ground / wheel
-        radii.append(float(np.median(ratio)))
         turning.add(role)
-        count += len(wheel)
-        lines.append(PlotLine(ride.name, wheel, ratio, "."))
-    if not radii:
+        lines.append(PlotLine(ride.name, wheel, over_ground / wheel, "."))
+    if not lines:
         raise LackingError(f"no ride tells the wheel's radius: {'; '.join(result.refusals) or 'none given'}")
-    each, n, names = np.array(radii), len(radii), ", ".join(trace.label for trace in lines)
+    each, n = np.array([np.median(line.y) for line in lines]), len(lines)
     radius = float(np.mean(each))
     spread = float(np.std(each, ddof=1)) if n > 1 else 3 * RIDE.receiver_sd * radius
     sd = float(np.hypot(spread / np.sqrt(n), RIDE.receiver_sd * radius))
     channel = f"gps_speed over {' and '.join(sorted(turning))}"
     source = (
-        f"{names}: {channel}, {count} fixes at steady speed, {each.min():.4f} to "
-        f"{each.max():.4f} m; slip of the driven wheel included"
+        f"{', '.join(line.label for line in lines)}: {channel}, {sum(len(line.x) for line in lines)} fixes at steady "
+        f"speed, {each.min():.4f} to {each.max():.4f} m; slip of the driven wheel included"
     )
     result.parameters["wheel_radius"] = Found(radius, sd, "m", source, channel)
-    if n > 1:
-        left = n / (n - 1) * (each - radius)  # each by the mean of the others
-        rms, largest = float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
-        result.fits.append(Fit("wheel radius", "m", rms, largest, None, n, True, f"each of {names} left out"))
-    ends = np.array([RIDE.slowest, max(float(t.x.max()) * radius for t in lines)]) / radius
+    ends = np.array([RIDE.slowest / radius, max(float(line.x.max()) for line in lines)])
     lines.append(PlotLine("radius", ends, np.full(2, radius)))
     x_label = "speed of the driven wheel [rad/s]"
     result.panels.append(Panel("Speed over ground by wheel speed", x_label, "m", tuple(lines)))
@@ -147,189 +135,158 @@ def _steady(columns: Mapping[str, tuple[Array, Array]], role: str, gear: float) 
     return speed[steady], wheel[steady] * gear
 
 
+# --- readings of pack and inverter ---------------------------------------------------------------------------------
+
+
+class PackReadings(NamedTuple):
+    """Readings of one ride at the times of the pack's current, each (n,) in s, A or V.
+
+    inverter, inverter_voltage: with the lag taken off; without the inverter's sensors no current and the pack's
+    voltage. others: currents of lamps and control, heater and air conditioner. rest: whether the vehicle stands without
+    load. lag: of the pack's sensors behind the inverter's [s].
+    """
+
+    name: str
+    time: Array
+    pack: Array
+    pack_voltage: Array
+    inverter: Array
+    inverter_voltage: Array
+    others: Array
+    rest: Mask
+    lag: float
+
+    def means(self, values: Array, seconds: float) -> Array:
+        """Means of `values` over windows of that length: timing counts less."""
+        return block_means(values, max(round(seconds / max(float(np.median(np.diff(self.time))), 1e-3)), 1))
+
+    def mean_at_rest(self, values: Array) -> float:
+        """The mean of `values` (n,) while the vehicle rests."""
+        return float(values[self.rest].mean())
+
+    def noise(self, values: Array) -> float:
+        """The sd of a sample, out of differences of neighbours that both are at rest."""
+        both = self.rest[1:] & self.rest[:-1]
+        return float(np.std(np.diff(values)[both]) / np.sqrt(2)) if both.sum() > 5 else float("nan")
+
+
+def read_pack(ride: Recording, vehicle: Vehicle, auxiliary: float | None = None) -> PackReadings:
+    """The readings of a ride with `PACK`.
+
+    auxiliary: power [W] of lamps and control of a ride without auxiliary_current; the vehicle file's if None. Pack
+    current less the others is the inverter's DC current; the inverter's own small consumption at rest does not show in
+    its reading, but is in the pack's. InputError for a ride with neither the inverter's sensors nor a speed.
+    """
+    p, size = vehicle.parameters, sizes_of(vehicle).current
+    time, pack = ride.columns["pack_current"]
+
+    def at(role: str, lag: float = 0.0) -> Array:
+        return np.interp(time - lag, *ride.columns[role])
+
+    voltage = at("pack_voltage")
+    if "auxiliary_current" in ride.columns:
+        others = at("auxiliary_current")
+    else:
+        others = (p["auxiliary_power"] if auxiliary is None else auxiliary) / np.maximum(voltage, 1.0)
+    for load in LOADS:
+        if load in ride.columns:
+            others = others + at(load) / np.maximum(voltage, 1.0)
+    if not ride.columns.keys() >= PAIRED:
+        role, factor = speed_role(ride.name, ride.columns, p)
+        still = np.abs(at(role)) * factor < RIDE.standing
+        return PackReadings(ride.name, time, pack, voltage, np.zeros_like(pack), voltage, others, still, 0.0)
+    lag = float(min(LAGS, key=lambda x: float(np.std(pack - others - at("inverter_current", x)))))
+    inverter = at("inverter_current", lag)
+    rest = (np.abs(at("motor_speed")) < RIDE.moving) & (np.abs(at("motor_current")) < RIDE.driving * size)
+    rest &= np.abs(inverter) < RIDE.fed * size
+    return PackReadings(ride.name, time, pack, voltage, inverter, at("inverter_voltage", lag), others, rest, lag)
+
+
+def _missing_sensors(rides: Sequence[Recording]) -> str:
+    """Which of `PAIRED` no ride has."""
+    return ", ".join(sorted(PAIRED.difference(*(ride.columns for ride in rides))))
+
+
 # --- auxiliary power -----------------------------------------------------------------------------------------------
 
 
 def auxiliary_power(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """auxiliary_power [W]: lamps, dashboard and control, the mean over the rides, each counting once (eq. 2.19).
 
-    By the auxiliary current, else by the pack's power at standstill. Raises InputError if no ride has either.
+    By the auxiliary current; if no ride has it, by the pack's power at standstill less the inverter's own and what
+    heating and cooling take. The brake light is in it as often as these riders braked. The sd is that of a ride to
+    come, and of the sensor or the inverter's own. LackingError if no ride has either.
     """
-    if any(set(AUXILIARY) <= ride.columns.keys() for ride in rides):
-        return _by_auxiliary_current(rides)
-    return _by_standstill(rides, vehicle)
-
-
-def _by_auxiliary_current(rides: Sequence[Recording]) -> Result:
-    """The brake light makes it one of two values; the mean holds it as often as these riders braked.
-
-    The sd is that of one ride's mean, and of the sensor.
-    """
-    result = Result("auxiliary")
-    rows = []  # mean, without and with light, share of the light, samples
-
-    def mean_of(values: Array) -> float:
-        return float(values.mean()) if len(values) > 9 else float("nan")
-
+    result, p, means = Result("auxiliary"), vehicle.parameters, []
+    by_current = any(ride.columns.keys() >= AUXILIARY for ride in rides)
+    if not by_current:
+        result.notes.append("no ride has auxiliary_current: taken from the pack's power at standstill instead")
     for ride in rides:
-        if missing := [role for role in AUXILIARY if role not in ride.columns]:
+        if missing := sorted((AUXILIARY if by_current else PACK) - ride.columns.keys()):
             result.notes.append(f"{ride.name}: no {missing[0]}, left out")
-            continue
-        time, current = ride.columns["auxiliary_current"]
-        power = current * np.interp(time, *ride.columns["pack_voltage"])
-        brake = ride.columns.get("brake_switch")
-        light = held_at(time, *brake) > 0.5 if brake else np.zeros(len(time), dtype=bool)
-        rows.append((power.mean(), mean_of(power[~light]), mean_of(power[light]), light.mean(), len(power)))
-    mean, without, lit, share, points = np.array(rows).T
-    value, n = float(mean.mean()), len(mean)
-    if value <= 0:
-        raise InputError(f"auxiliary power is {value:.3g} W: auxiliary_current must be positive when consuming")
-    spread = float(mean.std(ddof=1)) if n > 1 else 0.05 * value
-    source = f"{n} rides, {int(points.sum())} samples"
-    if np.isfinite(lit).any():
-        off, on = float(np.nanmean(without)) if np.isfinite(without).any() else np.nan, float(np.nanmean(lit))
-        result.notes.append(
-            f"{off:.1f} W without, {on:.1f} W with brake light, which shone {100 * share.mean():.0f} % of the time"
-        )
-        source += f"; {off:.1f} W, {on:.1f} W with brake light"
-    else:
-        result.refusals.append("auxiliary power of the brake light: no ride has brake_switch with the brake on")
-    sd = float(np.hypot(spread, RIDE.shunt_sd * value))
-    result.parameters["auxiliary_power"] = Found(value, sd, "W", source, "auxiliary_current times pack_voltage")
-    if n > 1:
-        others, by = (mean.sum() - mean) / (n - 1), f"each of {n} rides by the others"
-        result.fits.append(score("auxiliary power, mean of a ride", "W", mean, others, held_out=True, source=by))
-    x = np.arange(n, dtype=float)
-    lines = (
-        PlotLine("without brake light", x, without, "."),
-        PlotLine("with brake light", x, lit, "."),
-        PlotLine("mean", x, np.full(n, value)),
-    )
-    result.panels.append(Panel("Auxiliary power", "ride", "power [W]", lines))
-    return result
-
-
-def _by_standstill(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
-    """The pack's power while the vehicle stands, less the inverter's own and what heating and cooling take.
-
-    Its sd is of a ride to come, with that of the inverter's own. LackingError for rides without standstill.
-    """
-    result, p = Result("auxiliary"), vehicle.parameters
-    result.notes.append("no ride has auxiliary_current: taken from the pack's power at standstill instead")
-    means = []
-    for ride in rides:
-        if missing := [role for role in PACK if role not in ride.columns]:
-            result.notes.append(f"{ride.name}: no {missing[0]}, left out")
-            continue
-        still, power = _standing(ride, p)
-        if still.sum() >= RIDE.fewest_rest:
-            means.append(float(np.median(power[still])))
+        elif by_current:
+            time, current = ride.columns["auxiliary_current"]
+            means.append(float(np.mean(current * np.interp(time, *ride.columns["pack_voltage"]))))
+        else:
+            reading = read_pack(ride, vehicle, auxiliary=0.0)
+            power = reading.pack_voltage * (reading.pack - reading.inverter - reading.others)
+            if reading.rest.sum() >= RIDE.fewest_rest:
+                means.append(float(np.median(power[reading.rest])) - p["inverter_loss_constant"])
     if not means:
         raise LackingError("no ride has auxiliary_current, and none stands still with pack_voltage and pack_current")
-    mean = float(np.mean(means))
-    if mean <= 0:
-        raise InputError(f"the pack gives {mean:.3g} W at standstill: its current must be positive when discharging")
-    spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.2 * mean
-    sd = float(np.hypot(spread, p.sd("inverter_loss_constant")))
-    span = f"{min(means):.0f} to {max(means):.0f} W"
-    source = f"pack power at standstill of {len(means)} rides, {span}, less the inverter's own"
-    result.parameters["auxiliary_power"] = Found(mean, sd, "W", source, "pack_voltage times pack_current")
+    value = float(np.mean(means))
+    if value <= 0:
+        sign = "auxiliary_current must be positive when consuming, pack_current when discharging"
+        raise InputError(f"auxiliary power is {value:.3g} W: {sign}")
+    spread = float(np.std(means, ddof=1)) if len(means) > 1 else (0.05 if by_current else 0.2) * value
+    sensor = RIDE.shunt_sd * value if by_current else p.sd("inverter_loss_constant")
+    source = f"{len(means)} rides, {min(means):.1f} to {max(means):.1f} W"
+    source += "" if by_current else ": pack power at standstill less the inverter's own"
+    channel = f"{'auxiliary_current' if by_current else 'pack_current'} times pack_voltage"
+    result.parameters["auxiliary_power"] = Found(value, float(np.hypot(spread, sensor)), "W", source, channel)
     return result
-
-
-def _standing(ride: Recording, p: Mapping[str, float]) -> tuple[Mask, Array]:
-    """(whether the vehicle stands; the pack's power [W] less the inverter's own, a heater's and an air conditioner's).
-
-    At the times of the pack's current, (n,). InputError for a ride without a speed.
-    """
-    role, factor = speed_role(ride.name, ride.columns, p)
-    time, current = ride.columns["pack_current"]
-    power = current * np.interp(time, *ride.columns["pack_voltage"]) - p["inverter_loss_constant"]
-    for load in LOADS:
-        if load in ride.columns:
-            power = power - np.interp(time, *ride.columns[load])
-    return np.abs(np.interp(time, *ride.columns[role])) * factor < RIDE.standing, power
 
 
 # --- sensors of the pack -------------------------------------------------------------------------------------------
 
 
-class Pair(NamedTuple):
-    """Two readings of one ride at the times of the pack's current [s], and whether the vehicle stood without load."""
-
-    name: str
-    time: Array
-    pack: Array
-    inverter: Array
-    auxiliary: Array
-    pack_voltage: Array
-    inverter_voltage: Array
-    rest: Mask
-    lag: float  # s: of the pack's sensors behind the inverter's
-
-    def means(self, values: Array, seconds: float) -> Array:
-        """Means of `values` over windows of that length: timing counts less."""
-        return block_means(values, max(round(seconds / max(float(np.median(np.diff(self.time))), 1e-3)), 1))
-
-
-def read_pair(ride: Recording, vehicle: Vehicle) -> Pair:
-    """The readings of pack and inverter at the same times, their lag taken off. LackingError for missing signals.
-
-    Pack current less auxiliary current is the inverter's DC current; the inverter's own small consumption at rest does
-    not show in its reading, but is in the pack's.
-    """
-    for role in PAIRED:
-        if role not in ride.columns:
-            raise LackingError(f"{ride.name}: no {role}, which sensor offsets and resistances need")
-    time, pack = ride.columns["pack_current"]
-
-    def at(role: str, lag: float = 0.0) -> Array:
-        return np.interp(time - lag, *ride.columns[role])
-
-    if "auxiliary_current" in ride.columns:
-        auxiliary = at("auxiliary_current")
-    else:
-        auxiliary = vehicle.parameters["auxiliary_power"] / np.maximum(at("pack_voltage"), 1.0)
-    lag = float(min(LAGS, key=lambda x: float(np.std(pack - auxiliary - at("inverter_current", x)))))
-    inverter, size = at("inverter_current", lag), sizes_of(vehicle).current
-    rest = (np.abs(at("motor_speed")) < RIDE.moving) & (np.abs(at("motor_current")) < RIDE.driving * size)
-    rest &= np.abs(inverter) < RIDE.fed * size
-    volts = at("pack_voltage"), at("inverter_voltage", lag)
-    return Pair(ride.name, time, pack, inverter, auxiliary, *volts, rest, lag)
-
-
 def offsets(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     """pack_current_offset, pack_current_gain, both noises and pack_voltage_offset of the pack's sensors.
 
-    Of rides that all lack the inverter's, see `_at_standstill`. Raises InputError if none stands still long enough.
+    If no ride has the inverter's sensors: both noises, and of rides with auxiliary_current the offset, at standstill.
+    LackingError if no ride stands still long enough.
     """
-    if not rides:
-        raise InputError("no ride, which sensor offsets come from")
-    pairs = [read_pair(ride, vehicle) for ride in rides if set(PAIRED) <= ride.columns.keys()]
-    if not pairs:
-        return _at_standstill(rides, vehicle)
-    resting = [pair for pair in pairs if pair.rest.sum() >= RIDE.fewest_rest]
+    sizes, result = sizes_of(vehicle), Result("offsets")
+    paired = [ride for ride in rides if ride.columns.keys() >= PAIRED]
+    used = paired or [ride for ride in rides if ride.columns.keys() >= PACK]
+    if not paired:
+        result.notes.append(f"no ride has {_missing_sensors(rides)}: taken from the pack's sensors at standstill")
+    elif left_out := [ride.name for ride in rides if not ride.columns.keys() >= PAIRED]:
+        result.notes.append(f"{', '.join(left_out)}: left out; needed are {', '.join(sorted(PAIRED))}")
+    readings = [read_pack(ride, vehicle) for ride in used]
+    resting = [reading for reading in readings if reading.rest.sum() >= RIDE.fewest_rest]
     if not resting:
-        raise InputError(
-            f"{pairs[0].name}: no ride stands without load for {RIDE.fewest_rest} samples; offsets show at rest"
+        raise LackingError(
+            f"no ride with {' and '.join(sorted(PACK))} stands without load for {RIDE.fewest_rest} samples; offsets "
+            "show at rest"
         )
-    p, sizes, result = vehicle.parameters, sizes_of(vehicle), Result("offsets")
-    if left_out := [ride.name for ride in rides if ride.name not in {pair.name for pair in pairs}]:
-        result.notes.append(f"{', '.join(left_out)}: left out; needed are {', '.join(PAIRED)}")
-    own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
-    apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
-    spread, sd = _offset_sd(apart - own, vehicle, float(resting[0].pack_voltage.mean()))
-    result.parameters["pack_current_offset"] = Found(
-        float(np.mean(apart - own)),
-        sd,
-        "A",
-        f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
-        f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
-        "pack_current less inverter_current and auxiliary_current at rest",
-    )
-    _gain(result, pairs, RIDE.gain_span * sizes.current)
-    _noises(result, [(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
-    volts = float(np.mean([(pair.pack_voltage - pair.inverter_voltage)[pair.rest].mean() for pair in resting]))
+    named = {ride.name for ride in used if paired or "auxiliary_current" in ride.columns}
+    _offset(result, [reading for reading in resting if reading.name in named], vehicle, bool(paired))
+    for name, unit, noises in (
+        ("pack_current_noise", "A", [reading.noise(reading.pack) for reading in resting]),
+        ("pack_voltage_noise", "V", [reading.noise(reading.pack_voltage) for reading in resting]),
+    ):
+        sd = float(np.std(noises, ddof=1)) if len(noises) > 1 else 0.2 * noises[0]
+        source = f"first differences at rest, {len(noises)} rides, white"
+        result.parameters[name] = Found(float(np.median(noises)), max(sd, 1e-4), unit, source)
+    if not paired:
+        result.refusals.append(
+            "pack_current_gain, pack_voltage_offset: need inverter_current and inverter_voltage; what the file says "
+            "stays"
+        )
+        return result
+    _gain(result, readings, RIDE.gain_span * sizes.current)
+    volts = float(np.mean([x.mean_at_rest(x.pack_voltage - x.inverter_voltage) for x in resting]))
     result.parameters["pack_voltage_offset"] = Found(
         0.0,
         max(abs(volts), RIDE.least_apart * sizes.voltage),
@@ -340,102 +297,58 @@ def offsets(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
         f"pack_voltage_offset: {volts:+.3f} V between two sensors is all that the data tell, not which one "
         "errs; left at zero with that sd"
     )
-    lags = [pair.lag for pair in pairs]
+    lags = [reading.lag for reading in readings]
     result.notes.append(
         f"pack's sensors lag the inverter's by {np.median(lags):.2f} s ({min(lags):.2f} to {max(lags):.2f})"
     )
     return result
 
 
-def _at_standstill(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
-    """Both noises and, of rides with auxiliary_current, pack_current_offset, while the vehicle stands.
+def _offset(result: Result, resting: Sequence[PackReadings], vehicle: Vehicle, paired: bool) -> None:
+    """pack_current_offset of rides at rest. The sd is that of a ride to come.
 
-    Raises LackingError if no ride has pack_voltage and pack_current and stands long enough.
+    Beside the scatter from ride to ride, the inverter's own loss and the auxiliary sensor's class are in it.
     """
-    result = Result("offsets")
-    lacking = sorted(set(PAIRED).difference(*(ride.columns for ride in rides)))
-    missing = f"no ride has all of {', '.join(PAIRED)}" + (f" (none has {', '.join(lacking)})" if lacking else "")
-    noises, apart, volts = [], [], 1.0
-    for ride in rides:
-        if not set(PACK) <= ride.columns.keys():
-            continue
-        (still, power), (time, current) = _standing(ride, vehicle.parameters), ride.columns["pack_current"]
-        if still.sum() < RIDE.fewest_rest:
-            continue
-        voltage = np.interp(time, *ride.columns["pack_voltage"])
-        noises.append((_noise(current, still), _noise(voltage, still)))
-        if "auxiliary_current" in ride.columns:
-            volts = float(voltage[still].mean())
-            over = power / voltage - np.interp(time, *ride.columns["auxiliary_current"])
-            apart.append(float(over[still].mean()))
-    if not noises:
-        raise LackingError(f"{missing}, nor stands for {RIDE.fewest_rest} samples with {' and '.join(PACK)}")
-    result.notes.append(f"{missing}: taken from the pack's sensors at standstill instead")
-    _noises(result, noises)
-    if apart:
-        sd = _offset_sd(np.array(apart), vehicle, volts)[1]
-        source = f"{len(apart)} rides at standstill: pack less auxiliary current and the inverter's own"
-        channel = "pack_current less auxiliary_current at standstill"
-        result.parameters["pack_current_offset"] = Found(float(np.mean(apart)), sd, "A", source, channel)
-    else:
+    if not resting:
         result.refusals.append(
             "pack_current_offset: needs inverter_current, or auxiliary_current at standstill; what the file says stays"
         )
-    result.refusals.append(
-        "pack_current_gain, pack_voltage_offset: need inverter_current and inverter_voltage; what the file says stays"
-    )
-    return result
-
-
-def _offset_sd(offsets: Array, vehicle: Vehicle, volts: float) -> tuple[float, float]:
-    """(scatter of those of the rides (n,), sd of that of a ride to come) [A], of a pack at `volts`.
-
-    Beside the scatter from ride to ride, the inverter's own loss and the auxiliary sensor's class are in the sd.
-    """
-    sizes = sizes_of(vehicle)
-    spread = float(np.std(offsets, ddof=1)) if len(offsets) > 1 else RIDE.first_spread * sizes.current
-    own = vehicle.parameters.sd("inverter_loss_constant") / volts
+        return
+    p, sizes = vehicle.parameters, sizes_of(vehicle)
+    loss, loss_sd = p["inverter_loss_constant"], p.sd("inverter_loss_constant")
+    apart = np.array([x.mean_at_rest(x.pack - x.inverter - x.others) for x in resting])
+    own = np.array([loss / x.mean_at_rest(x.pack_voltage) for x in resting])
+    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else RIDE.first_spread * sizes.current
+    scatter = max(spread, RIDE.drift_sd * sizes.current)
     auxiliary = RIDE.shunt_sd * RIDE.auxiliary * sizes.auxiliary / sizes.voltage
-    return spread, float(np.hypot(max(spread, RIDE.drift_sd * sizes.current), own) + auxiliary)
+    sd = float(np.hypot(scatter, loss_sd / resting[0].pack_voltage.mean()) + auxiliary)
+    source = (
+        f"{len(resting)} rides at rest: pack less {'inverter less ' if paired else ''}auxiliary is {apart.mean():+.3f} "
+        f"± {spread:.3f} A, {own.mean():.3f} A of it the inverter's own {loss:.1f} W"
+    )
+    channel = f"pack_current less {'inverter_current and ' if paired else ''}auxiliary_current at rest"
+    result.parameters["pack_current_offset"] = Found(float(np.mean(apart - own)), sd, "A", source, channel)
 
 
-def _noises(result: Result, noises: Sequence[tuple[float, float]]) -> None:
-    """pack_current_noise [A] and pack_voltage_noise [V] out of those of each ride."""
-    for (name, unit), column in zip((("pack_current", "A"), ("pack_voltage", "V")), np.array(noises).T, strict=True):
-        sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
-        source = f"first differences at rest, {len(column)} rides, white"
-        result.parameters[f"{name}_noise"] = Found(float(np.median(column)), max(sd, 1e-4), unit, source)
-
-
-def _noise(values: Array, rest: Mask) -> float:
-    """The sd of a sample, out of differences of neighbours that both are at rest."""
-    both = rest[1:] & rest[:-1]
-    return float(np.std(np.diff(values)[both]) / np.sqrt(2)) if both.sum() > 5 else float("nan")
-
-
-def _gain(result: Result, pairs: Sequence[Pair], least: float) -> None:
+def _gain(result: Result, readings: Sequence[PackReadings], least: float) -> None:
     """The pack's current over inverter's and auxiliary together, by ride, if they span `least` [A]."""
     name = "pack_current_gain"
-    rows = [[pair.means(x, RIDE.window) for x in (pair.inverter + pair.auxiliary, pair.pack)] for pair in pairs]
+    rows = [[x.means(column, RIDE.window) for column in (x.inverter + x.others, x.pack)] for x in readings]
     (x, y), labels = (np.concatenate(c) for c in zip(*rows, strict=True)), _labels([row[0] for row in rows])
     if np.ptp(x) < least:
         result.refusals.append(f"{name}: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
         return
-    fitted = every_second(labels)
-    found, model, outside = line(name, x, y, fitted, as_groups(labels))
-    source = f"{len(pairs)} rides, {len(x)} means of {RIDE.window:g} s, against inverter and auxiliary current"
+    found, model = line(name, x, y, as_groups(labels))
+    source = f"{len(readings)} rides, {len(x)} means of {RIDE.window:g} s, against inverter and auxiliary current"
     result.parameters[name] = found.found(name, "1", source, RIDE.gain_sd, "pack_current over inverter_current")
     result.refusals.append(
         f"{name}: {found[name]:.4f} ± {found.sd(name):.4f} is the ratio of "
         f"two sensors; which one errs is unknown, so that its sd holds a sensor's class of {100 * RIDE.gain_sd:.1f} %"
     )
-    result.fits += [
-        score("pack current", "A", y, model, held_out=False, source=source),
-        score("pack current", "A", y[~fitted], outside[~fitted], held_out=True, source="every second ride"),
-    ]
-    left, title = PlotLine("means of 2 s", x, y - model, "."), "Pack current against inverter and auxiliary"
-    x_label = "inverter and auxiliary current [A]"
-    result.panels.append(Panel(title, x_label, "pack current less line [A]", (left,)))
+    result.fits.append(score("pack current", "A", y, model, held_out=False, source=source))
+    title, x_label = "Pack current against inverter and auxiliary", "inverter and auxiliary current [A]"
+    residual = PlotLine("means of 2 s", x, y - model, ".")
+    result.panels.append(Panel(title, x_label, "pack current less line [A]", (residual,)))
 
 
 def _labels(columns: Sequence[Array]) -> Array:
@@ -447,16 +360,21 @@ def _labels(columns: Sequence[Array]) -> Array:
 
 
 def resistances(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
-    """cable_resistance, of the rides with the inverter's sensors, and pack_series_resistance of all."""
+    """cable_resistance, of the rides with the inverter's sensors, and with `pulses` pack_series_resistance of all."""
     result = Result("resistance")
-    if with_inverter := [ride for ride in rides if set(PAIRED) <= ride.columns.keys()]:
+    if with_inverter := [ride for ride in rides if ride.columns.keys() >= PAIRED]:
         result.add(cable_resistance(with_inverter, vehicle))
     else:
-        lacking = sorted(set(PAIRED).difference(*(ride.columns for ride in rides)))
         result.refusals.append(
-            f"cable_resistance: needs {', '.join(lacking)}, which no ride has; the value of the file stays"
+            f"cable_resistance: needs {_missing_sensors(rides)}, which no ride has; the value of the file stays"
         )
-    result.add(pack_series_resistance(rides, vehicle, pulses))
+    if pulses:
+        result.add(pack_series_resistance(rides, vehicle, pulses))
+    else:
+        result.refusals.append(
+            "pack_series_resistance: needs pulse tests of a cell (pulses), which tell the cells' part; the value of "
+            "the file stays"
+        )
     return result
 
 
@@ -465,11 +383,11 @@ def cable_resistance(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
 
     Raises InputError for rides without current.
     """
-    result, name, pairs = Result("resistance"), "cable_resistance", [read_pair(ride, vehicle) for ride in rides]
-    rows = [
-        [p.means(x, RIDE.cable_window) for x in (p.inverter, p.pack_voltage - p.inverter_voltage, p.pack_voltage)]
-        for p in pairs
-    ]
+    result, name = Result("resistance"), "cable_resistance"
+    rows = []
+    for reading in (read_pack(ride, vehicle) for ride in rides):
+        drop = reading.pack_voltage - reading.inverter_voltage
+        rows.append([reading.means(x, RIDE.cable_window) for x in (reading.inverter, drop, reading.pack_voltage)])
     (i, v, pack), label = (np.concatenate(c) for c in zip(*rows, strict=True)), _labels([row[0] for row in rows])
     span = RIDE.cable_span * sizes_of(vehicle).current
     if np.ptp(i) < span:
@@ -477,17 +395,13 @@ def cable_resistance(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
             f"{rides[0].name}: inverter_current of {i.min():.1f} to {i.max():.1f} A spans too little for a resistance; "
             f"{span:g} A are needed"
         )
-    fitted = every_second(label)
-    found, model, outside = line(name, i, v, fitted, as_groups(label))
+    found, model = line(name, i, v, as_groups(label))
     if found[name] < -3 * found.sd(name):
         raise InputError(f"{rides[0].name}: inverter_voltage rises over pack_voltage with current: a sign is wrong")
-    what = "voltage between pack and inverter"
     source = f"{len(rides)} rides, {len(i)} means of 1 s, pack less inverter voltage over inverter current"
-    result.fits += [
-        score(what, "V", v, model, held_out=False, source=source),
-        score(what, "V", v[~fitted], outside[~fitted], held_out=True, source="every second ride"),
-    ]
-    gains = 2**0.5 * RIDE.voltage_gain_sd * abs(line("sag", i, pack, fitted)[0]["sag"])
+    fit = score("voltage between pack and inverter", "V", v, model, held_out=False, source=source)
+    result.fits.append(fit)
+    gains = 2**0.5 * RIDE.voltage_gain_sd * abs(line("sag", i, pack)[0]["sag"])
     source += f"; {found['offset']:+.3f} V at no current"
     channel, sd = "pack_voltage less inverter_voltage over inverter_current", float(np.hypot(found.sd(name), gains))
     result.parameters[name] = Found(max(found[name], 0.0), sd, "ohm", source, channel)
@@ -496,16 +410,15 @@ def cable_resistance(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     return result
 
 
-def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
+def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements]) -> Result:
     """pack_series_resistance [ohm]: 0.2 s steps of warm rides less what the cells alone give in that time.
 
     pulses: pulse tests of a cell at two temperatures or more, with `time`, `current`, `voltage` and `cell_temperature`:
-    their steps of the same length are the cells' part. Without them it is R0 and the RC pair of the vehicle file, which
-    hold for a longer time than a step and so leave less. Raises InputError if there are too few large steps. Gives a
+    their steps of the same length are the cells' part. Raises InputError if there are too few large steps. Gives a
     refusal instead of a number where the cells' own doubt is greater than what is left.
     """
     c, result, name = RIDE, Result("resistance"), "pack_series_resistance"
-    by_temperature, least = cell_steps(pulses) if pulses else None, c.least_step * sizes_of(vehicle).current
+    by_temperature, least = cell_steps(pulses), c.least_step * sizes_of(vehicle).current
     of_rides = [_ride_steps(ride, vehicle, by_temperature, least, result) for ride in rides]
     steps = [columns for columns in of_rides if columns is not None]
     count = sum(len(di) for di, _, _ in steps)
@@ -518,10 +431,9 @@ def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses:
     found = linear({"series": di}, dv - cell * di, groups=as_groups(_labels([di for di, _, _ in steps])))
     value, sd = found["series"], float(np.hypot(found.sd("series"), c.cells_sd * float(cell.mean())))
     whole = linear({"whole": di}, dv)["whole"]
-    origin = "the pulse tests' steps" if pulses else "the cell tables"
     source = (
         f"{len(di)} steps above {least:g} A within {c.step_time:g} s of {len(steps)} rides above {c.warm:g} degC: "
-        f"{1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of {origin}"
+        f"{1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of the pulse tests' steps"
     )
     model = (cell + value) * di
     result.fits.append(score("voltage step", "V", dv, model, held_out=False, source=source))
@@ -538,7 +450,7 @@ def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses:
 
 
 def _ride_steps(
-    ride: Recording, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, least: float, result: Result
+    ride: Recording, vehicle: Vehicle, by_temperature: tuple[Array, Array], least: float, result: Result
 ) -> tuple[Array, Array, Array] | None:
     """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
 
@@ -549,8 +461,11 @@ def _ride_steps(
     if "cell_temperature" not in ride.columns:
         raise InputError(f"{ride.name}: no cell_temperature, without which the cells' part of a step is unknown")
     temperature = float(ride.columns["cell_temperature"][1].mean())
-    if temperature < c.warm:
-        result.notes.append(f"{ride.name}: cells at {temperature:.0f} degC, left out: {c.warm:g} degC are needed")
+    low, high = max(c.warm, by_temperature[0][0]), by_temperature[0][-1]
+    if not low <= temperature <= high:
+        result.notes.append(
+            f"{ride.name}: cells at {temperature:.0f} degC, left out: {low:.0f} to {high:.0f} degC are needed"
+        )
         return None
     columns = true_columns(ride.columns, vehicle.parameters)
     time, current = columns["pack_current"]
@@ -560,22 +475,7 @@ def _ride_steps(
     big = np.abs(step) > least
     if not big.any():
         return None
-    if by_temperature is None:
-        volts, amperes = float(np.median(voltage[:5])), float(np.median(current[:5]))
-        load = standing_load(amperes, volts, vehicle.parameters["auxiliary_power"])
-        start = first_soc(vehicle.model.at(Port.CELL_VOLTAGE), battery, (volts, amperes), temperature, load)
-        charge = float(np.trapezoid(current, time))  # A·s; what half of it takes is the middle of the ride
-        soc = start - discharged(charge, 0.5, battery.pack_capacity(temperature))
-        r0, r1, c1 = battery.circuit(soc, temperature)
-        cell_ohm = r0 + r1 * (1 - np.exp(-c.step_time / 2 / (r1 * c1)))
-    else:
-        low, high = by_temperature[0][[0, -1]]
-        if not low <= temperature <= high:
-            result.notes.append(
-                f"{ride.name}: cells at {temperature:.0f} degC, outside the tests' {low:.0f} to {high:.0f}, left out"
-            )
-            return None
-        cell_ohm = float(np.exp(np.interp(temperature, *by_temperature)))
+    cell_ohm = float(np.exp(np.interp(temperature, *by_temperature)))
     cells = battery.cells_series / battery.cells_parallel * cell_ohm
     return step[big], drop[big], np.full(int(big.sum()), cells)
 
