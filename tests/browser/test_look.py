@@ -142,22 +142,6 @@ def test_all_can_be_read_in_the_sun(page, theme):
 # --- keyboard and screen reader -------------------------------------------------------------------------------------
 
 
-def test_by_keyboard(page):
-    with dashboard("keys") as address, Sender("keys", HEALTHY):
-        page.goto(address)
-        shows(page, range_value="34")
-        reached = []
-        for _ in range(3):
-            page.keyboard.press("Tab")
-            reached.append(page.evaluate("document.activeElement.id"))
-            outline = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
-            assert outline == "solid"
-        assert reached == ["theme", "unit", "language"]
-        page.keyboard.press("Shift+Tab")
-        page.keyboard.press("Enter")
-        shows(page, range_value="21")
-
-
 def test_a_screen_reader_hears_changes_of_state_and_not_every_tick(page):
     with dashboard("reader") as address, Sender("reader", HEALTHY) as sender:
         page.goto(address)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
@@ -349,17 +348,6 @@ def test_wide_identifiers_without_bit_31_are_read_as_29_bits_and_said(tmp_path, 
 def test_a_dbc_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"none\.dbc: cannot be read: No such file"):
         load_database([tmp_path / "none.dbc"])
-
-
-def test_two_files_may_not_use_the_same_identifier(tmp_path, caplog, capfd):
-    (tmp_path / "a.dbc").write_text(DBC)
-    (tmp_path / "b.dbc").write_text(DBC.replace("Pack", "Other").replace("257 Motor", "300 Motor2"))
-    with pytest.raises(InputError) as caught, caplog.at_level(logging.WARNING):
-        load_database([tmp_path / "a.dbc", tmp_path / "b.dbc"])
-    for part in ("b.dbc:5", "identifier 0x100", "Other", "Pack in", "a.dbc:5"):
-        assert part in str(caught.value)
-    assert not caplog.records
-    assert capfd.readouterr().err == ""
 
 
 def test_parameter_groups_must_be_told_apart(tmp_path):

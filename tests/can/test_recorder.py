@@ -4,7 +4,6 @@ import json
 import os
 import random
 import resource
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ from mcap.reader import make_reader
 
 from gz_onboard.can import logfile
 from gz_onboard.can.logfile import LogFile, object_schema
-from gz_onboard.can.recorder import BackgroundRecorder, LogLimits, Recorder, is_complete
+from gz_onboard.can.recorder import LogLimits, Recorder, is_complete
 from gz_onboard.events import Frame
 from gz_onboard.recording import logs
 from gz_onboard.recording.readers.contents import LogDamage
@@ -140,22 +139,6 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
     assert log.errors == 0
 
 
-def test_files_are_rotated_by_age_and_each_stands_for_itself(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", attachments={"a.dbc": b"text"}, limits=LogLimits(max_age_s=10))
-    log.channel("/estimate", SCHEMA)
-    batches = ticks(25)
-    for batch in batches:
-        log.frames(batch)
-        log.sample("/estimate", batch[0][0], {"range": 1.0, "soc": 2.0})
-        log.sync(batch[-1][0])
-    log.close()
-    assert len(log.paths) == 3
-    assert flat([read(path) for path in log.paths]) == flat(batches)
-    for path in log.paths:
-        assert logs.read_attachments(path) == {"a.dbc": b"text"}
-        assert {topic for topic, _, _ in logs.read_samples(path)} == {"/estimate"}
-
-
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """The kernel refuses to let any file grow beyond this: like a full disk, an error in the middle of a write."""
@@ -260,36 +243,3 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
 
 
 # --- in the background -----------------------------------------------------------------------------------------
-
-
-def test_a_disk_that_does_not_answer_holds_up_nobody_and_what_is_lost_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, answer = threading.Event(), threading.Event()
-    real = os.fdatasync
-
-    def late(descriptor: int) -> None:
-        asked.set()
-        answer.wait(60)
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fdatasync", late)
-    log = Recorder(tmp_path, "ref", limits=LogLimits(sync_s=0.5))
-    behind = BackgroundRecorder(log, limit=2000)
-    batches = ticks(20)  # 10000 frames; were it to wait with the disk, it would be for a minute at each sync
-    for batch in batches:
-        behind.frames(batch)
-        behind.sync(batch[-1][0])
-        while not asked.is_set() and not behind._thread.wait(0.01):
-            pass
-    assert "slow" in behind.error
-    lost = behind.lost_frames
-    assert 0 < lost < 10_000
-    assert not behind.close(0.2)
-    answer.set()
-    assert behind.close(30)
-    behind.sync(batches[-1][-1][0] + SECOND)
-    assert not behind.error
-    there = read(log.paths[0])
-    assert len(there) + lost == len(flat(batches))
-    assert set(there) <= set(flat(batches))

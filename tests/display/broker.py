@@ -52,6 +52,7 @@ class Listener:
     def __init__(self, port: int, login: tuple[str, str] | None = None) -> None:
         self.last: dict[str, Any] = {}
         self.heard: list[tuple[str, Any]] = []
+        self.expires: dict[str, int | None] = {}  # s, by topic
         self.client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5)
         if login:
             self.client.username_pw_set(*login)
@@ -64,6 +65,7 @@ class Listener:
         values = json.loads(message.payload)
         self.last[message.topic] = values
         self.heard.append((message.topic, values))
+        self.expires[message.topic] = getattr(message.properties, "MessageExpiryInterval", None)
 
     def close(self) -> None:
         self.client.disconnect()

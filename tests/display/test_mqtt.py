@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any
@@ -55,6 +54,7 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
     with broker(tmp_path, port), listening(port) as listener, bridge(port, "m1", monkeypatch=monkeypatch) as said:
         wait_for(lambda: STATE in listener.last, "a state")
         assert seen(listener) == {"alert": "silent"}
+        assert listener.expires == {STATE: 30, ABOUT: None}  # a broker that loses power loses the last will
         with Sender("m1", ESTIMATE) as sender:
             wait_for(lambda: {"range", "state_of_charge", "energy_left"} <= seen(listener).keys(), "the range")
             found = seen(listener)
@@ -102,27 +102,6 @@ def test_of_a_bridge_that_is_killed_no_number_is_left(tmp_path):
         with listening(port) as late:
             wait_for(lambda: STATE in late.last, "what was kept")
             assert late.last[STATE]["status"] == "offline"
-
-
-def test_the_state_does_not_outlive_who_says_it(tmp_path, monkeypatch):
-    """A last will is lost with a broker that loses power; what it kept until then must end by itself."""
-    monkeypatch.setattr(mqtt, "EXPIRES_S", 2)
-    monkeypatch.setattr(mqtt, "AT_LEAST_S", 1000.0)
-    port = free_port()
-    with broker(tmp_path, port), bridge(port, "m3", monkeypatch=monkeypatch):
-        with listening(port) as listener:
-            wait_for(lambda: STATE in listener.last, "a state")
-
-        def forgotten() -> bool:
-            with listening(port) as late:
-                wait_for(lambda: ABOUT in late.last, "what is kept for ever")
-                done = threading.Event()
-                late.client.on_publish = lambda *_: done.set()
-                late.client.publish("end", "{}", qos=1)
-                wait_for(lambda: "end" in late.last, "all that is kept has come before")
-                return STATE not in late.last
-
-        wait_for(forgotten, "the state is forgotten")
 
 
 def test_user_and_password(tmp_path, monkeypatch):
