@@ -35,7 +35,7 @@ from gz_onboard.errors import InputError, brief, not_an_input, writing
 from gz_onboard.estimation import summary as summaries
 from gz_onboard.estimation.report import ReportedRide, check_page, page_of, report_of, section_of
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, open_estimate, run_ride, state_for
-from gz_onboard.estimation.saved_state import held, text_of
+from gz_onboard.estimation.saved_state import held, save_state
 from gz_onboard.estimation.summary import RideSummary
 from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.events import Frame
@@ -46,7 +46,7 @@ from gz_onboard.progress import Progress
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import logs_among
 from gz_onboard.recording.readers.contents import LogDamage
-from gz_onboard.recording.recording import Recording, read_recording, ride_name
+from gz_onboard.recording.recording import Recording, facts_of, read_recording, ride_name
 from gz_onboard.recording.tables import SignalTable, table_of
 from gz_onboard.reports.results import descriptions, distinct_names
 from gz_onboard.reports.tables import Columns, Tabular, array_of, columns_of, table_columns, time_array
@@ -240,20 +240,17 @@ def estimate(
     continue from if there is one and to save after the ride; saved before the ride began. progress: takes numbers of
     frames. Raises InputError.
     """
-    given, known, log = _source(source), _vehicle(vehicle), MemoryLog()
+    given, log = _source(source), MemoryLog()
+    ride = open_estimate(given, _vehicle(vehicle))
     options = RideOptions(filter_name, route=None if route is None else read_route(Path(route)))
     if state is None:
-        run = run_ride(open_estimate(given, known), options, log, progress)
+        run = run_ride(ride, options, log, progress)
     else:
-        file = Path(state)
+        file, facts = Path(state), facts_of(given) if isinstance(given, Path) else {}
         not_an_input(state_files.copies(file), [given] if isinstance(given, Path) else [])
         with held(file):
-            at = state_for(file, given, known)
-            at.check_date(given if isinstance(given, Path) else given.name)
-            run = run_ride(open_estimate(given, known), replace(options, state=at), log, progress)
-            if text := text_of(run.pipeline):
-                with writing(file):
-                    state_files.write(file, text)
+            run = run_ride(ride, replace(options, state=state_for(file, ride, facts)), log, progress)
+            save_state(file, run.pipeline)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]
     columns = table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")})
     estimates = LoggedEstimates(columns, times, log.values(ESTIMATE_TOPIC))

@@ -21,7 +21,7 @@ from gz_onboard.can.logfile import LogFile
 from gz_onboard.can.recorder import is_complete
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import RideOptions, known_vehicle, open_estimate, run_ride, state_for, vehicle_of
-from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, held, latest, saved_at, text_of, when
+from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, held, latest, save_state, saved_at, when
 from gz_onboard.estimation.summary import (
     SUMMARY_VERSION,
     TABLE_FORMATS,
@@ -41,7 +41,7 @@ from gz_onboard.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.frames import SignalColumns
 from gz_onboard.recording.logs import ESTIMATED, digest_of, read_metadata, read_samples
-from gz_onboard.recording.recording import of_ride
+from gz_onboard.recording.recording import facts_of, of_ride
 from gz_onboard.reports.charts import overview
 from gz_onboard.reports.results import Failure, clock, number, write_json
 from gz_onboard.reports.style import save
@@ -155,20 +155,19 @@ def _results(
 def in_order(
     tasks: Sequence[EstimateTask], file: Path
 ) -> tuple[list[EstimateTask], list[tuple[EstimateTask, InputError]]]:
-    """Sort tasks by the times of their rides, each with the state `file` to continue from; and those not readable.
+    """Sort tasks by the times of their rides, each with the state `file` to continue from; and those without a time.
 
     Of an earlier run those results are kept that the state includes: of rides that ended before it was saved.
-    InputError naming the logs if two overlap or are of two vehicles, or if one has no date.
+    InputError naming the logs if two overlap or are of two vehicles.
     """
     found: list[tuple[RideState, EstimateTask]] = []
     unread: list[tuple[EstimateTask, InputError]] = []
     for task in tasks:
         try:
-            found.append((state_for(file, task.path, vehicle_of(task)), task))
+            ride = open_estimate(task.path, vehicle_of(task))
+            found.append((state_for(file, ride, facts_of(task.path)), task))
         except InputError as error:
             unread.append((task, error))
-    for at, task in found:
-        at.check_date(task.path)
     found.sort(key=lambda one: one[0].begin_ns)
     for (one, before), (other, after) in pairwise(found):
         if one.vehicle != other.vehicle:
@@ -226,7 +225,6 @@ def _estimate(task: EstimateTask) -> RideSummary:
         try:
             options = RideOptions(task.filter_name, task.frames, task.signals, route, state=task.state)
             found = run_ride(ride, options, log)
-            learned = text_of(found.pipeline) if task.state else None
             summary = summary_of(found, task.log, task.picture)
             log.note(_RECORD, {**_inputs(task), _SUMMARY: encode_summary(summary)})
             log.close()
@@ -236,9 +234,8 @@ def _estimate(task: EstimateTask) -> RideSummary:
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
-    if task.state and learned:
-        with writing(task.state.file):
-            state.write(task.state.file, learned)
+    if task.state:
+        save_state(task.state.file, found.pipeline)
     return summary
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import held_at
+from gz_onboard.arrays import Array, held_at
+from gz_onboard.can.codec import LONGEST_PAUSE_NS, Codec
 from gz_onboard.constants import WH
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, known_vehicle, open_estimate, run_ride, vehicle_of
@@ -24,7 +25,7 @@ from gz_onboard.options import add_shared
 from gz_onboard.processes import Task, collect, over_rides
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.recording.logs import logs_among
-from gz_onboard.recording.recording import Recording, read_recording, ride_name
+from gz_onboard.recording.recording import extended, read_roles, ride_name
 from gz_onboard.recording.tables import SignalTable
 from gz_onboard.reports.charts import TEMPERATURE_COLOURS, Row, Series, overview, path_map, range_over_distance
 from gz_onboard.reports.page import Bar, bar_table, drawn, html_table, page, tiles
@@ -153,36 +154,36 @@ def report_of(
     progress: Progress | None = None,
 ) -> ReportedRide:
     """Estimate a ride as the daemon would, with its ledger, path and temperatures. Raises InputError."""
+    log, ride = MemoryLog(), open_estimate(source, vehicle)
     road = read_route(route) if route else None
-    log = MemoryLog()
-    ridden = run_ride(open_estimate(source, vehicle), RideOptions(route=road, ledger=True), log, progress)
-    samples = read_recording(source, vehicle)
+    ridden = run_ride(ride, RideOptions(route=road, ledger=True), log, progress)
+    codec = Codec(extended(ride.vehicle.mapping), LONGEST_PAUSE_NS)
+    columns = read_roles(ride.source, ride.vehicle, codec, ride.frames)
     return ReportedRide(
-        samples.name,
+        ride_name(ride.source),
         summary_of(ridden),
         [dict(row) for row in log.values(ESTIMATE_TOPIC)],
         ridden.pipeline.estimator.forecaster.load.ledger or Ledger(),
-        path_of(samples) if located else [],
-        {role: _series(samples, role) for role in TEMPERATURE_COLOURS if role in samples.columns},
+        path_of(columns) if located else [],
+        {role: _series(*columns[role]) for role in TEMPERATURE_COLOURS if role in columns},
     )
 
 
-def _series(samples: Recording, role: str) -> Series:
+def _series(times: Array, values: Array) -> Series:
     """The samples of a role, with a NaN in each hole, through which no line is drawn."""
-    times, values = samples.columns[role]
     holes = np.flatnonzero(np.diff(times) > LONGEST_GAP_S) + 1
     return np.insert(times, holes, times[holes]).tolist(), np.insert(values, holes, np.nan).tolist()
 
 
-def path_of(samples: Recording) -> list[list[Position]]:
-    """The positions by a receiver with a fix, split at holes; empty with fewer than two."""
-    if not {"latitude", "longitude"} <= samples.columns.keys():
+def path_of(columns: Mapping[str, tuple[Array, Array]]) -> list[list[Position]]:
+    """The positions by a receiver with a fix, split at holes; empty with fewer than two. columns: by role."""
+    if not {"latitude", "longitude"} <= columns.keys():
         return []
-    times, latitude = samples.columns["latitude"]
-    longitude = held_at(times, *samples.columns["longitude"])
-    seen = times >= samples.columns["longitude"][0][0]
-    if "gps_fix" in samples.columns:
-        seen &= held_at(times, *samples.columns["gps_fix"]) >= FIX_2D
+    times, latitude = columns["latitude"]
+    longitude = held_at(times, *columns["longitude"])
+    seen = times >= columns["longitude"][0][0]
+    if "gps_fix" in columns:
+        seen &= held_at(times, *columns["gps_fix"]) >= FIX_2D
     places = np.column_stack([latitude, longitude])[seen]
     runs = np.split(places, np.flatnonzero(np.diff(times[seen]) > LONGEST_GAP_S) + 1)
     return [[(a, b) for a, b in run.tolist()] for run in runs if len(run) > 1]

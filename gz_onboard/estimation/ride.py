@@ -27,9 +27,10 @@ from gz_onboard.progress import Progress
 from gz_onboard.recording.decode import decode_columns, feed
 from gz_onboard.recording.frames import FrameColumns, SignalColumns
 from gz_onboard.recording.readers.contents import LogDamage
-from gz_onboard.recording.recording import check_ridden, facts_of, of_ride, open_ride
+from gz_onboard.recording.recording import check_ridden, of_ride, open_ride
 from gz_onboard.recording.tables import SignalTable
 from gz_onboard.recording.timeline import on_timeline
+from gz_onboard.reports.results import FIRST_DATE_NS
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -247,17 +248,22 @@ def run_ride(ride: OpenRide, options: RideOptions, log: Log | None = None, progr
     return RideRun(ride, options, pipeline, statistics, *took, resumed)
 
 
-def state_for(file: Path, source: Path | SignalTable, vehicle: Vehicle, progress: Progress | None = None) -> RideState:
-    """Return the saved state `file` for the ride in `source`, whose times are by its clock as it is set at the end."""
-    ride = open_estimate(source, vehicle)
+def state_for(file: Path, ride: OpenRide, facts: Mapping[str, object]) -> RideState:
+    """Return the saved state `file` for a ride, whose times are by its clock as it is set at the end.
+
+    InputError for a ride without a date, which has no place among others.
+    """
     codec = Codec(replace(ride.vehicle.mapping, sources=(), requests=()), LONGEST_PAUSE_NS)
     on_timeline(ride.frames.time_ns, codec)
-    if progress:
-        progress(len(ride.frames))
-    rider = "" if isinstance(source, SignalTable) else str(facts_of(source).get("rider", ""))
+    if codec.time_ns(0.0) < FIRST_DATE_NS:
+        raise InputError(
+            f"{ride.source}: has no date, as its clock was not set; a saved state needs the times of the rides, for "
+            "their order and what passed between them"
+        )
+    rider = str(facts.get("rider", ""))
     if len(rider) > CONSUMPTION.most_name_letters:
         raise InputError(
-            f"{source}: rides.json: rider {rider!r}: must have at most {CONSUMPTION.most_name_letters} letters"
+            f"{ride.source}: rides.json: rider {rider!r}: must have at most {CONSUMPTION.most_name_letters} letters"
         )
     return RideState(file, codec.time_ns(0.0), codec.last_ns, ride.vehicle.name, rider)
 

@@ -17,7 +17,6 @@ from gz_onboard import state
 from gz_onboard.can.codec import BACK_NS
 from gz_onboard.errors import InputError, writing
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.reports.results import FIRST_DATE_NS
 
 SUFFIX = ".json"
 MAX_OVERLAP_S = 2e-9 * BACK_NS  # of the two parts of a log that was cut
@@ -36,14 +35,6 @@ class RideState:
     end_ns: int
     vehicle: str
     rider: str = ""
-
-    def check_date(self, ride: Path) -> None:
-        """InputError for a ride without a date, which has no place among others."""
-        if self.begin_ns < FIRST_DATE_NS:
-            raise InputError(
-                f"{ride}: has no date, as its clock was not set; a saved state needs the times of the rides, for "
-                "their order and what passed between them"
-            )
 
 
 @dataclass(frozen=True)
@@ -98,15 +89,11 @@ def saved_at(copy: Path) -> float | None:
     return None if found is None or found[1] is None else _FAR_FUTURE_S - found[1]
 
 
-def text_of(pipeline: Pipeline) -> bytes | None:
-    """Encode the state after a ride; None while nothing is known. InputError if it cannot be saved."""
-    snapshot = pipeline.estimator.snapshot(pipeline.vehicle.key)
-    if snapshot is None:
-        return None
-    try:
-        return state.encode(snapshot, pipeline.codec.last_ns * 1e-9)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"the state after the ride cannot be saved: {error}") from error
+def save_state(file: Path, pipeline: Pipeline) -> None:
+    """Save the state after a ride, if anything is known. InputError if the file cannot be written."""
+    if snapshot := pipeline.estimator.snapshot(pipeline.vehicle.key):
+        with writing(file):
+            state.write(file, state.encode(snapshot, pipeline.codec.last_ns * 1e-9))
 
 
 @contextmanager

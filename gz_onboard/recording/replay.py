@@ -14,14 +14,15 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import chain
+from functools import partial
+from itertools import chain, cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
-from gz_onboard.progress import progress_bar
+from gz_onboard.progress import Display, progress_bar
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import log_suffix, logs_among, read_log
 from gz_onboard.recording.readers.contents import LogDamage
@@ -36,7 +37,7 @@ Send = Callable[[Frame], bool]
 _FULL_WAIT_S = 0.001
 _FULL_ATTEMPTS = 1000
 _EARLY_NS = 50_000  # sleeping takes as long: a frame due within this is sent now
-_LOOP_GAP_S = 0.001
+_LOG_GAP_S = 0.001
 _PROGRESS_NS = 500_000_000
 
 
@@ -47,19 +48,14 @@ class Sent:
     sent: int = 0
     failed: int = 0
     skipped: int = 0
-    loops: int = 0
     duration_s: float = 0.0
     worst_lateness_s: float = 0.0
 
     def __str__(self) -> str:
-        text = f"{self.sent} frames in {self.duration_s:.1f} s, at worst {self.worst_lateness_s * 1e3:.1f} ms late"
-        if self.loops > 1:
-            text += f", {self.loops} rounds"
-        if self.failed:
-            text += f"; {self.failed} frames could not be sent"
-        if self.skipped:
-            text += f"; {self.skipped} frames left out"
-        return text
+        return (
+            f"{self.sent} frames in {self.duration_s:.1f} s, at worst {self.worst_lateness_s * 1e3:.1f} ms late; "
+            f"{self.failed} could not be sent, {self.skipped} left out"
+        )
 
 
 def replay(
@@ -157,24 +153,20 @@ def run(arguments: argparse.Namespace) -> int:
     with ExitStack() as buses, progress_bar(lambda: None, quiet=arguments.quiet) as display:
         send = bus_sender(*(buses.enter_context(_open_bus(arguments.interface, name)) for name in channels))
         try:
-            while True:
-                summary.loops += 1
-                for log, frames in parts:
-                    what = "the log" if len(parts) == 1 else log.name
-
-                    def show(seconds: float, what: str = what) -> None:
-                        display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
-
-                    replay(frames.batches(), send, arguments.speed, summary, show)
-                if not arguments.loop:
-                    break
-                time.sleep(_LOOP_GAP_S)
+            for log, frames in cycle(parts) if arguments.loop else parts:
+                show = partial(_show, display, log.name)
+                replay(frames.batches(), send, arguments.speed, summary, show)
+                time.sleep(_LOG_GAP_S)
         except KeyboardInterrupt:
             status = INTERRUPTED
     for text in dict.fromkeys(map(str, damages)):
         print(text, file=sys.stderr)
     print(f"replayed {arguments.log}: {summary}")
     return status
+
+
+def _show(display: Display, log: str, seconds: float) -> None:
+    display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {log} sent")
 
 
 def _parts(

@@ -234,7 +234,7 @@ def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
     frames = cuts["c"]
     begin, half = frames[0][0], frames[len(frames) // 2][0]
     write_log(tmp_path / "set.mcap", [(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames])
-    span = state_for(tmp_path / "s.json", tmp_path / "set.mcap", reference())
+    span = state_for(tmp_path / "s.json", open_estimate(tmp_path / "set.mcap", reference()), {})
     assert span.end_ns == frames[-1][0]
     assert span.begin_ns == pytest.approx(begin, abs=0.1 * S)
 
@@ -310,7 +310,7 @@ def test_what_does_not_go_together(short, tmp_path, capsys):
     assert "--jobs 2 with --state" in refused(out, capsys, short, options=["--jobs", 2])
     undated = tmp_path / "undated.blf"
     write_log(undated, [(t % DAY, *rest) for t, *rest in recorded("coastdown", 0, 5)])  # type: ignore[misc]
-    assert f"{undated}: has no date" in refused(out, capsys, undated, short)
+    assert f"{undated}: has no date" in refused(out, capsys, undated)
     assert "ends in .json" in refused(out, capsys, short, options=["--state", "s.blf"])
     assert "would overwrite the input" in refused(out, capsys, short, options=["--state", short])
     descriptor = os.open(out, os.O_RDONLY)

@@ -155,7 +155,7 @@ def test_looping_ends_cleanly_on_an_interrupt(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "rounds" in out
+    assert int(out.partition("replayed ")[2].partition(": ")[2].split()[0]) > 20
     assert "Traceback" not in err
 
 
@@ -166,4 +166,4 @@ def test_a_bus_that_is_down_loses_frames_and_they_are_counted() -> None:
 
     summary = replay([frames(10)], bus_sender(Down()), 0)  # type: ignore[arg-type]
     assert (summary.sent, summary.failed) == (0, 10)
-    assert "10 frames could not be sent" in str(summary)
+    assert "10 could not be sent" in str(summary)

@@ -13,7 +13,6 @@ from gz_onboard.cli import main
 from gz_onboard.estimation.report import changed_by, path_of
 from gz_onboard.estimation.summary import Why
 from gz_onboard.estimator.load_model import Ledger
-from gz_onboard.recording.recording import Recording
 from tests.support import LOGS
 
 
@@ -31,10 +30,10 @@ def test_the_path_has_holes_where_there_is_no_fix():
         "longitude": (time, np.full(60, 8.0)),
         "gps_fix": (time, np.where((time >= 20) & (time < 40), 0.0, 3.0)),
     }
-    path = path_of(Recording("ride", columns))
+    path = path_of(columns)
     assert [len(run) for run in path] == [20, 20]
     assert path[1][0] == pytest.approx((50.004, 8.0))
-    assert path_of(Recording("ride", {"latitude": columns["latitude"]})) == []
+    assert path_of({"latitude": columns["latitude"]}) == []
 
 
 def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(tmp_path, monkeypatch, capsys):
