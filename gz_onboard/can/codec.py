@@ -133,15 +133,13 @@ class MessageDecoder:
     def _intact(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
         """Drop frames with a wrong length, checksum or counter; return the others, and their data in one piece."""
         length, protection, faults = self.message.length, self.protection, self._codec.faults
-        parts = [frame[2] for frame in frames]
-        if set(map(len, parts)) != {length}:
-            wrong = [len(part) for part in parts if len(part) != length]
+        wrong = [len(frame[2]) for frame in frames if len(frame[2]) != length]
+        if wrong:
             faults[self.name, LENGTH] += len(wrong)
             if self.origin is None:
                 self._codec.wrong_lengths[self.name] = wrong[-1]
             frames = [frame for frame in frames if len(frame[2]) == length]
-            parts = [frame[2] for frame in frames]
-        data = b"".join(parts)
+        data = b"".join([frame[2] for frame in frames])
         if protection.crc:
             differences = crc_differences(data, length)
             if any(differences):

@@ -19,7 +19,6 @@ from gz_onboard.display import foxglove as command
 from gz_onboard.display.vehicle_frames import VehicleFrames
 from gz_onboard.events import Frame
 from gz_onboard.log_rows import ESTIMATE_UNITS, LOCATION_SCHEMA, TEXTS, declare, estimate_row, location_row
-from gz_onboard.pipeline import Pipeline
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import read_vehicle
 from tests.display.served import ESTIMATE, Sender, command_running, send
@@ -137,23 +136,6 @@ def positions_of(frames: VehicleFrames, ridden: list[Frame]) -> dict[int, Any]:
         if place := frames.values(frame[0] * 1e-9)["position"]:
             found.setdefault(place["time_ns"], place)
     return found
-
-
-def test_positions_are_those_of_the_log(ridden):
-    logged = Kept()
-    Pipeline(read_vehicle("reference"), log=logged).advance(ridden, ridden[-1][0])
-    found = positions_of(VehicleFrames(read_vehicle("reference"), positions=True), ridden)
-    rows = [location_row(frame="gps", **one) for one in found.values()]
-    once_a_second = logged.rows["/location"]
-    assert len(once_a_second) >= SECONDS - 1
-    at = {(row["timestamp"]["sec"], row["timestamp"]["nsec"]): row for row in rows}
-    assert list(at) == sorted(at)
-    for row in once_a_second:
-        place = at[row["timestamp"]["sec"], row["timestamp"]["nsec"]]
-        assert {**place, "altitude": None} == {**row, "altitude": None}
-        if place is not rows[0]:  # the altitude comes by a message of its own
-            assert place["altitude"] == pytest.approx(row["altitude"], abs=1.0)
-    assert len(rows) > 4 * len(once_a_second)  # each as it comes
 
 
 @pytest.mark.parametrize(("fix", "told"), [(0, None), (1, None), (2, False), (3, True)])
