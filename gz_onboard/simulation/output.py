@@ -81,15 +81,14 @@ def _pictures(
     """The figures by the ending of their files."""
     from gz_onboard.simulation import figures
 
-    energy = figures.sankey(result.ledger, vehicle.model.effects, f"{title}: energy")
+    energy = figures.ledger_bars(result.ledger, vehicle.model.effects, f"{title}: energy")
     pictures = {"": figures.overview(result, title), ".ledger": energy}
     if plan.recorded:
         pictures[".measured"] = figures.comparison(result, measured_columns(plan.recorded, result), title)
     if sweeps:
         if any(sweep.name == "payload_mass" for sweep in sweeps):
             title = title.partition(", payload")[0]
-        draw = figures.sweep_lines if len(sweeps) == 1 else figures.sweep_map
-        pictures[".sweep"] = draw(sweeps, summary.sweep or [], title)
+        pictures[".sweep"] = figures.sweep_lines(sweeps, summary.sweep or [], title)
     return pictures
 
 

@@ -65,6 +65,7 @@ SAMPLE = 0.1  # s: from row to row of the series
 # 1066.425).
 TOLERANCE = 3.2 / 3.6  # m/s
 TOLERANCE_TIME = 1.0  # s
+OPEN = 0.95  # mean throttle of a vehicle that can no more
 LOADED = 0.1  # state of charge: a ride that ended with more left was ended by the load
 
 Command = Callable[[Scooter], tuple[float, float, float]]
@@ -73,33 +74,28 @@ Command = Callable[[Scooter], tuple[float, float, float]]
 
 @dataclass(frozen=True)
 class Shortfall:
-    """A stretch in which the ride was slower than the profile, beyond the tolerance."""
+    """A stretch in which the ride was slower than the profile, beyond the tolerance; time and distance: its begin."""
 
-    time: float  # s, its begin
-    distance: float  # m, its begin
-    duration: float  # s
-    missing: float  # m/s, at most
-    wanted: float  # m/s, where most was missing
-    throttle: float  # the mean in it: near 1, the vehicle could not; below, the rider did not
-
-    @property
-    def beyond_vehicle(self) -> bool:
-        """Whether the throttle was open all along."""
-        return self.throttle > 0.95
+    time_s: float
+    distance_km: float
+    duration_s: float
+    missing_km_h: float  # at most
+    wanted_km_h: float  # where most was missing
+    beyond_vehicle: bool  # the throttle was open all along; else it is the rider's lag
 
 
 @dataclass(frozen=True)
-class Beyond:
+class BeyondBattery:
     """A pack at its cut-off voltage or below, or without charge; the state where that begins."""
 
     charge: bool  # no charge is left; else the load pulled the voltage down
-    duration: float  # s, in all
-    cutoff: float  # V of the pack
-    time: float  # s
-    distance: float  # m
+    time_s: float
+    distance_km: float
+    duration_s: float  # in all
     soc: float
-    current: float  # A
-    voltage: float  # V
+    current_a: float
+    voltage_v: float
+    cutoff_v: float  # of the pack
 
 
 @dataclass
@@ -117,7 +113,7 @@ class Run:
     soc_end: float
     form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
-    beyond: tuple[Beyond, ...] = ()  # demands that the battery could not meet
+    beyond: tuple[BeyondBattery, ...] = ()  # demands that the battery could not meet
     shortfalls: list[Shortfall] = field(default_factory=list)
 
     __repr__ = brief
@@ -252,7 +248,7 @@ def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[f
 # --- demands beyond the vehicle ---------------------------------------------------------------------------------------
 
 
-def beyond_pack(series: Mapping[str, Array], cutoff: float) -> tuple[Beyond, ...]:
+def beyond_pack(series: Mapping[str, Array], cutoff: float) -> tuple[BeyondBattery, ...]:
     """Where a load pulled the pack's voltage to `cutoff` [V] or below, and from where on it had no charge left.
 
     series: by the names of `COLUMNS`.
@@ -264,13 +260,23 @@ def beyond_pack(series: Mapping[str, Array], cutoff: float) -> tuple[Beyond, ...
     found = []
     for charge, there in ((False, low), (True, out)):
         if there.any():
-            i, seconds = int(np.argmax(there)), float(there.sum()) * step
-            names = ("time", "distance", "soc", "pack_current", "pack_voltage")
-            found.append(Beyond(charge, seconds, cutoff, *(float(series[name][i]) for name in names)))
+            first = {name: float(column[np.argmax(there)]) for name, column in series.items()}
+            found.append(
+                BeyondBattery(
+                    charge,
+                    first["time"],
+                    first["distance"] * 1e-3,
+                    float(there.sum()) * step,
+                    first["soc"],
+                    first["pack_current"],
+                    first["pack_voltage"],
+                    cutoff,
+                )
+            )
     return tuple(found)
 
 
-def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
+def shortfalls(series: Mapping[str, Array]) -> list[Shortfall]:
     """Where the speed stayed below all that was wanted within a second, by more than the tolerance; worst first."""
     from numpy.lib.stride_tricks import sliding_window_view
 
@@ -284,15 +290,17 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
     found = []
     for begin, end in stretches(missing > 0):
         worst = begin + int(np.argmax(missing[begin:end]))
-        throttle = float(series["throttle"][begin:end].mean())
-        lasts = float(time[min(end, len(time) - 1)] - time[begin])
-        missed = float(wanted[worst] - speed[worst])
         found.append(
             Shortfall(
-                float(time[begin]), float(series["distance"][begin]), lasts, missed, float(wanted[worst]), throttle
+                float(time[begin]),
+                float(series["distance"][begin]) * 1e-3,
+                float(time[min(end, len(time) - 1)] - time[begin]),
+                float(wanted[worst] - speed[worst]) * 3.6,
+                float(wanted[worst]) * 3.6,
+                float(series["throttle"][begin:end].mean()) > OPEN,
             )
         )
-    return sorted(found, key=lambda s: -s.missing * s.duration)
+    return sorted(found, key=lambda one: -one.missing_km_h * one.duration_s)
 
 
 # --- range --------------------------------------------------------------------------------------------------------
@@ -314,12 +322,12 @@ def range_by_energy(scooter: Scooter, run: Run) -> float | None:
     factor of the current. So it is never less than the distance ridden. At the start, the same equation would take the
     mean temperature of the cells, and their voltage losses as settled, from the first metre.
     """
-    consumption = run.consumption
-    if consumption is None or consumption <= 0:
+    without_charge = run.beyond and run.beyond[-1].charge and not run.empty
+    if without_charge or run.consumption is None or run.consumption <= 0:
         return None
     warm = float(run.series["cell_temperature"][-1])
     left = energy_left(scooter.vehicle, run.soc_end, warm, run.mean_power, run.form_factor_squared)
-    return run.distance + left / consumption
+    return run.distance + left / run.consumption
 
 
 def ran_empty(vehicle: Vehicle, run: Run, power: float, form_factor_squared: float) -> int | None:

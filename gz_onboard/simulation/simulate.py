@@ -169,6 +169,6 @@ def variant(
 ) -> Variant:
     """The ride with other `values` of the swept parameters."""
     result, scooter = ride(redesigned(vehicle, values), plan, options, progress)
-    metres, _ = cycle_range(result, scooter)
-    shortfall = sum(s.duration for s in result.shortfalls)
-    return Variant(values, times(result.consumption, 1 / WH_PER_KM), times(metres, 1e-3), shortfall)
+    range_km, _ = cycle_range(result, scooter)
+    shortfall = sum(s.duration_s for s in result.shortfalls)
+    return Variant(values, times(result.consumption, 1 / WH_PER_KM), range_km, shortfall)

@@ -13,7 +13,7 @@ from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.reports.results import clock, descriptions, number, plain, text_rows, times
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
-from gz_onboard.simulation.run import COLUMNS, LOADED, Run, range_by_energy
+from gz_onboard.simulation.run import COLUMNS, LOADED, BeyondBattery, Run, Shortfall, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import Vehicle
 
@@ -25,36 +25,8 @@ _RANGE_BY = {
     "energy": "ridden, and energy left at the end over the consumption",
     None: "not known",
 }
-_WHY_SLOW = {True: "beyond the vehicle", False: "the rider's lag"}
 _SHOWN = 5  # shortfalls
 _LEAST = 0.005  # Wh: less of the ledger is not shown
-_FARTHER = 0.05  # km: less would not show
-
-
-@dataclass(frozen=True)
-class ShortfallEntry:
-    """A stretch in which the ride was slower than wanted."""
-
-    time_s: float
-    distance_km: float
-    duration_s: float
-    missing_km_h: float
-    wanted_km_h: float
-    beyond_vehicle: bool
-
-
-@dataclass(frozen=True)
-class BeyondEntry:
-    """Demand of the ride that the battery cannot meet."""
-
-    charge: bool
-    time_s: float
-    distance_km: float
-    duration_s: float
-    soc: float
-    current_a: float
-    voltage_v: float
-    cutoff_v: float
 
 
 @dataclass(frozen=True)
@@ -109,13 +81,13 @@ class SimulationSummary:
         "ridden until a load pulled the voltage there; charge: ridden until none was left",
     ]
     shortfalls: Annotated[
-        list[ShortfallEntry],
+        list[Shortfall],
         "where the profile asked more than was ridden, worst first: time_s, distance_km, duration_s"
         ", missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
     ]
     shortfall_s: Annotated[float, "their time in all"]
     beyond_battery: Annotated[
-        list[BeyondEntry],
+        list[BeyondBattery],
         "demands beyond the battery: charge (true: empty; false: a load pulled its voltage to the cut-off), "
         "where it begins time_s, distance_km, soc, current_a, voltage_v; duration_s in all; cutoff_v",
     ]
@@ -144,26 +116,19 @@ KEYS = descriptions(SimulationSummary)
 
 
 def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:
-    """(range [m], how it was found)."""
+    """(range [km], how it was found)."""
     if result.empty:
         load = result.beyond and result.soc_end > LOADED
-        return result.distance, "cut-off" if load else "repetition"
+        return result.distance * 1e-3, "cut-off" if load else "repetition"
     if result.beyond and result.beyond[-1].charge and result.soc_start > 0.0:
-        return result.beyond[-1].distance, "charge"
-    metres = by_energy(result, scooter)
-    return metres, None if metres is None else "energy"
-
-
-def by_energy(result: Run, scooter: Scooter) -> float | None:
-    """Distance ridden and energy left over the consumption [m]; unknown if the ride continued without charge."""
-    if result.beyond and result.beyond[-1].charge and not result.empty:
-        return None
-    return range_by_energy(scooter, result)
+        return result.beyond[-1].distance_km, "charge"
+    metres = range_by_energy(scooter, result)
+    return times(metres, 1e-3), None if metres is None else "energy"
 
 
 def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Scooter) -> SimulationSummary:
     """The summary, without what only the command knows: its time, sweep and files."""
-    metres, by = cycle_range(result, scooter)
+    range_km, by = cycle_range(result, scooter)
     return SimulationSummary(
         what=what,
         kind=plan.kind,
@@ -180,18 +145,12 @@ def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Sco
         consumption_wh_km=times(result.consumption, 1 / WH_PER_KM),
         soc_start=result.soc_start,
         soc_end=result.soc_end,
-        range_km=times(metres, 1e-3),
+        range_km=range_km,
         range_by=by,
-        shortfalls=[
-            ShortfallEntry(s.time, s.distance * 1e-3, s.duration, s.missing * 3.6, s.wanted * 3.6, s.beyond_vehicle)
-            for s in result.shortfalls
-        ],
-        shortfall_s=sum(s.duration for s in result.shortfalls),
-        beyond_battery=[
-            BeyondEntry(b.charge, b.time, b.distance * 1e-3, b.duration, b.soc, b.current, b.voltage, b.cutoff)
-            for b in result.beyond
-        ],
-        range_by_energy_km=times(by_energy(result, scooter), 1e-3),
+        shortfalls=result.shortfalls,
+        shortfall_s=sum(one.duration_s for one in result.shortfalls),
+        beyond_battery=list(result.beyond),
+        range_by_energy_km=times(range_by_energy(scooter, result), 1e-3),
         ledger_wh={name: energy / WH for name, energy in result.ledger.items()},
         closure=result.closure,
         chassis=scooter.chassis.name,
@@ -231,17 +190,11 @@ def summary_text(summary: SimulationSummary) -> str:
     """A summary for a terminal."""
     often = f"{summary.repetitions:.3g}"
     repeated = "" if summary.kind != "cycle" else ", once" if often == "1" else f", {often} times"
+    distance = f"{summary.distance_km:.2f} km, at most {summary.speed_max_km_h:.0f} km/h{repeated}"
+    recovered = f"{summary.energy_wh:.1f} Wh net, after {summary.energy_recovered_wh:.1f} Wh recovered"
     rows = [
-        (
-            summary.kind,
-            f"{clock(summary.duration_s)}, {summary.distance_km:.2f} km, "
-            f"at most {summary.speed_max_km_h:.0f} km/h{repeated}",
-        ),
-        (
-            "energy",
-            f"{summary.energy_wh:.1f} Wh net, after {summary.energy_recovered_wh:.1f} Wh recovered; "
-            f"{number(summary.consumption_wh_km, '.2f', 'Wh/km')}",
-        ),
+        (summary.kind, f"{clock(summary.duration_s)}, {distance}"),
+        ("energy", f"{recovered}; {number(summary.consumption_wh_km, '.2f', 'Wh/km')}"),
         ("state of charge", f"{100 * summary.soc_start:.1f} → {100 * summary.soc_end:.1f} %"),
         ("range", f"{number(summary.range_km, '.1f', 'km')} from the start ({_RANGE_BY[summary.range_by]})"),
         *_named("beyond the battery", _beyond_texts(summary)),
@@ -265,45 +218,30 @@ def _named(name: str, texts: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _beyond_texts(summary: SimulationSummary) -> list[str]:
-    """Demands beyond the battery, and why two ranges differ."""
+    """Demands beyond the battery, and how far the energy that is left would do."""
     texts = []
     for b in summary.beyond_battery:
-        place = f"{b.time_s:.0f} s, {b.distance_km:.2f} km"
-        if b.charge:
-            text = f"no charge is left from {place}: the ride continues {b.duration_s:.0f} s that no pack can give"
-            texts.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
-            continue
-        when = f"from {place}, for {b.duration_s:.0f} s in all" if b.duration_s >= 1.0 else f"at {place}"
+        begin = f"from {b.time_s:.0f} s, {b.distance_km:.2f} km, for {b.duration_s:.0f} s in all"
+        pulled = f"{b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at {100 * b.soc:.0f} % of charge"
         texts.append(
-            f"{when}, {b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at "
-            f"{100 * b.soc:.0f} % of charge: its cut-off is {b.cutoff_v:.1f} V"
+            f"{begin}, " + ("no charge is left" if b.charge else f"{pulled}: its cut-off is {b.cutoff_v:.1f} V")
         )
-    energy = summary.range_by_energy_km
-    if summary.range_by == "cut-off" and energy is not None:
-        more = energy - summary.distance_km >= _FARTHER
-        would = f"its energy would do for {energy:.1f} km" if more else "it goes farther only"
-        texts.append(
-            f"so it ends with {100 * summary.soc_end:.0f} % left; {would} at a lower current "
-            "(motor_current_limit, [controller] of the vehicle file)"
-        )
-    elif texts and summary.range_by == "energy":
-        texts.append("the range is that of the energy: a vehicle that gives up there, as --until-empty, ends there")
+    if summary.range_by == "cut-off" and summary.range_by_energy_km is not None:
+        left = f"so it ends with {100 * summary.soc_end:.0f} % left; its energy would do for"
+        lower = "a lower current (motor_current_limit, [controller] of the vehicle file)"
+        texts.append(f"{left} {summary.range_by_energy_km:.1f} km at {lower}")
     return texts
 
 
 def _shortfall_texts(summary: SimulationSummary) -> list[str]:
-    found = summary.shortfalls
-    if not found:
+    if not summary.shortfalls:
         return []
-    stretches = f"{len(found)} stretches; the worst" if len(found) > 1 else "one stretch"
-    return [
-        f"{summary.shortfall_s:.0f} s slower than wanted, in {stretches}:",
-        *(
-            f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s: {s.missing_km_h:.1f} km/h below "
-            f"{s.wanted_km_h:.0f} km/h: {_WHY_SLOW[s.beyond_vehicle]}"
-            for s in found[:_SHOWN]
-        ),
-    ]
+    worst = (
+        f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s: {s.missing_km_h:.1f} km/h below "
+        f"{s.wanted_km_h:.0f} km/h: {'beyond the vehicle' if s.beyond_vehicle else 'the lag of the rider'}"
+        for s in summary.shortfalls[:_SHOWN]
+    )
+    return [f"{summary.shortfall_s:.0f} s slower than wanted in all, stretches: {len(summary.shortfalls)}", *worst]
 
 
 def _ledger_texts(summary: SimulationSummary) -> list[str]:
@@ -334,10 +272,9 @@ def _measured_rows(m: MeasuredEntry | None) -> list[tuple[str, str]]:
 
 def variants_text(sweep: Sequence[Variant]) -> str:
     """A table of the variants, for a terminal."""
-    heads = [*sweep[0].values, "Wh/km", "range km", "shortfall s"]
-    lines = ["  ".join(f"{head:>10}" for head in heads)]
+    lines = ["  ".join(f"{head:>10}" for head in (*sweep[0].values, "Wh/km", "range km", "shortfall s"))]
     for v in sweep:
         results = number(v.consumption_wh_km, ".2f"), number(v.range_km, ".1f"), f"{v.shortfall_s:.0f}"
-        cells = [*(f"{value:g}" for value in v.values.values()), *results]
-        lines.append("  ".join(f"{cell:>{max(len(head), 10)}}" for cell, head in zip(cells, heads, strict=True)))
+        values = (f"{value:>{max(len(name), 10)}g}" for name, value in v.values.items())
+        lines.append("  ".join([*values, *(f"{result:>10}" for result in results)]))
     return "\n".join(lines)

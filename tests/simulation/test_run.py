@@ -51,10 +51,12 @@ def test_what_is_beyond_the_vehicle_is_told():
     worst = run.shortfalls[0]
     c = cycle("udds")
     fastest = c.time[c.speed.index(max(c.speed))]
-    assert worst.time < fastest < worst.time + worst.duration
-    assert worst.missing * 3.6 > 35
+    assert worst.time_s < fastest < worst.time_s + worst.duration_s
+    assert worst.missing_km_h > 35
     assert worst.beyond_vehicle
-    assert worst.distance == pytest.approx(np.interp(worst.time, run.series["time"], run.series["distance"]), abs=2)
+    assert 1e3 * worst.distance_km == pytest.approx(
+        np.interp(worst.time_s, run.series["time"], run.series["distance"]), abs=2
+    )
 
 
 def test_shortfall_of_a_made_up_ride():
@@ -71,11 +73,11 @@ def test_shortfall_of_a_made_up_ride():
         "distance": time * 9,
     }
     first, second = shortfalls(series)
-    assert first.time == pytest.approx(20.0)
-    assert first.duration == pytest.approx(10.0)
-    assert first.missing == pytest.approx(4.0)
+    assert first.time_s == pytest.approx(20.0)
+    assert first.duration_s == pytest.approx(10.0)
+    assert first.missing_km_h == pytest.approx(14.4)
     assert not first.beyond_vehicle
-    assert second.time == pytest.approx(40.0)
+    assert second.time_s == pytest.approx(40.0)
 
 
 def test_throttle_and_brake_of_a_ride_replayed_give_the_same_ride():
@@ -145,5 +147,5 @@ def test_a_hill_that_it_cannot_climb_is_a_shortfall_and_no_ride_backwards():
     assert run.distance > -20
     assert abs(run.series["speed"][-1]) < 0.01
     assert run.soc_end < run.soc_start
-    assert all(short.beyond_vehicle for short in run.shortfalls if short.duration > 10)
-    assert sum(short.duration for short in run.shortfalls) > 100
+    assert all(short.beyond_vehicle for short in run.shortfalls if short.duration_s > 10)
+    assert sum(short.duration_s for short in run.shortfalls) > 100
