@@ -35,12 +35,6 @@ _PARTS = {
     "wmtc_class2_2": ("wmtc_part1", "wmtc_part2"),
     "wmtc_class3_2": ("wmtc_part1", "wmtc_part2", "wmtc_part3"),
 }
-_MISSING = {
-    "wmtc_part2_reduced": "its speeds",
-    "wmtc_part3_reduced": "its speeds",
-    "wmtc_class2_1": "part 2 at reduced speed",
-    "wmtc_class3_1": "part 3 at reduced speed",
-}
 # (time [s], speed [km/h]) at the corners; straight lines between them.
 _ECE15 = (
     *((0, 0), (11, 0), (15, 15), (23, 15), (28, 0), (49, 0), (61, 32), (85, 32), (96, 0)),
@@ -65,17 +59,9 @@ class Cycle:
         """Time from the first sample to the last [s]."""
         return self.time[-1] - self.time[0]
 
-    def repeated(self, count: int) -> Cycle:
-        """The cycle `count` times, one after the other, the last sample of one being the first of the next.
-
-        Raises InputError if `count` is below 1, or if the cycle ends at another speed than it begins with.
-        """
-        if count < 1:
-            raise InputError(f"cycle {self.name}: cannot be ridden {count} times, must be at least 1")
-        if count == 1:
-            return self
-        time, speed = _joined((self,) * count)
-        return Cycle(f"{self.name}x{count}", time, speed, self.source, f"{self.title}, {count} times")
+    def check_closed(self) -> None:
+        """InputError if it ends at another speed than it begins with, and so cannot be repeated."""
+        _joined((self, self))
 
 
 def names() -> tuple[str, ...]:
@@ -89,11 +75,6 @@ def cycle(name: str) -> Cycle:
 
     Raises InputError, with the nearest name, if there is none.
     """
-    if name in _MISSING:
-        raise InputError(
-            f"cycle {name!r} is not built in: no table of {_MISSING[name]} was at hand; "
-            "give the regulation's speeds as a CSV file with columns time_s, speed_kmh"
-        )
     if name not in _TITLES:
         raise InputError(f"unknown cycle {name!r}{nearest(name, names())}; known are {', '.join(names())}")
     title, source = _TITLES[name]
@@ -144,7 +125,7 @@ def find_cycle(name_or_file: str) -> Cycle:
 
     Raises InputError, with the nearest built-in name, if there is neither.
     """
-    if name_or_file in _TITLES or name_or_file in _MISSING:
+    if name_or_file in _TITLES:
         return cycle(name_or_file)
     file = Path(name_or_file)
     if file.exists() or file.suffix:

@@ -157,5 +157,7 @@ def sweep_lines(sweeps: Sequence[Sweep], variants: Sequence[Variant], title: str
     for key, quantity in (("range_km", "range [km]"), ("consumption_wh_km", "consumption [Wh/km]")):
         values = np.array([getattr(variant, key) for variant in variants], dtype=float)
         rows = zip(values.reshape(len(names), -1), shades, names, strict=True)
-        panels.append([ChartPanel(quantity, [Line(y, shade, name, 1.6, "o-") for y, shade, name in rows], 2.0)])
+        panels.append(
+            [ChartPanel(quantity, [Line(y, shade, name or quantity, 1.6, "o-") for y, shade, name in rows], 2.0)]
+        )
     return chart(panels, np.array(last.values), last.label, title)

@@ -18,7 +18,7 @@ from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.export.logs import out_suffix, write_frames_as
 from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, SimulatedSensor, latency, shaken, spread
-from gz_onboard.simulation.trace import Truth
+from gz_onboard.simulation.truth import Truth
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:

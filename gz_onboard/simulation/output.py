@@ -18,7 +18,7 @@ from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import SimulationSummary, measured_columns, summary_text
 from gz_onboard.simulation.sweep import Sweep
-from gz_onboard.simulation.trace import Trace
+from gz_onboard.simulation.truth import Truth
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -65,10 +65,10 @@ def output_file(arguments: argparse.Namespace, plan: Plan, ending: str) -> Path:
     return Path(arguments.output / f"{plan.name}{mode}.simulation{ending}")
 
 
-def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
+def write_ride(arguments: argparse.Namespace, vehicle: Vehicle, result: Run, scooter: Scooter) -> str:
     """Write the ride's frames. Returns the name of the file. Raises InputError."""
     dropouts = Dropouts() if arguments.frame_loss is None else Dropouts(frames=arguments.frame_loss)
-    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, dropouts=dropouts)
+    sent = simulate_frames(vehicle, Truth(result, scooter), arguments.seed, dropouts=dropouts)
     with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)

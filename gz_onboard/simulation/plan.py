@@ -109,7 +109,7 @@ def _plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
         return _route_plan(path, options, roller)
     cycle = find_cycle(what)
     if options.repeat > 1 or options.until_empty:
-        cycle.repeated(2)  # its error if it ends at another speed than it begins with
+        cycle.check_closed()
     speeds = at_steps(cycle.time, cycle.speed, STEP)
     road = roller or straight(math.sin(math.atan(options.grade / 100)), options.wind)
     return Plan(cycle.name, "cycle", cycle.duration, road, lambda: follow(speeds, STEP))

@@ -31,6 +31,10 @@ COLUMNS = {
     "throttle": "1",
     "brake": "1",
     "grade": "1",
+    "curvature": "1/m",  # of the road, positive left
+    "climb": "m",
+    "vibration": "m/s^2",  # 0 unless an effect reads it
+    "wheel_speed": "rad/s",  # of the driven wheel
     "motor_speed": "rad/s",
     "motor_current": "A",
     "motor_torque": "N·m",
@@ -103,6 +107,7 @@ class Run:
     """Result of a ride. Energies in J."""
 
     series: dict[str, Array]  # by the names of `COLUMNS`, of one length
+    steps: dict[str, Array] | None  # the same for every step, if they were kept
     ledger: dict[str, float]  # every loss by name, and kinetic and potential energy gained; its sum is `chemical`
     chemical: float  # that has left the cells' chemistry
     energy: float  # delivered at the pack's terminals, less what was recovered
@@ -143,6 +148,7 @@ def drive(
     until_empty: bool = False,
     finish: float | None = None,
     progress: Progress | None = None,
+    keep_steps: bool = False,
 ) -> Run:
     """Ride for `seconds`; a row of the series each `SAMPLE`, the first before the first step.
 
@@ -150,6 +156,7 @@ def drive(
     """
     dt, step, states = scooter.dt, scooter.step, attrgetter(*_STATES.values())
     every = max(round(SAMPLE / dt), 1)
+    row_every = 1 if keep_steps else every
     battery = scooter.vehicle.pack
     cutoff = battery.cutoff_voltage * battery.cells_series
     end = finish if finish is not None else float("inf")
@@ -161,7 +168,7 @@ def drive(
         throttle, brake, wanted = command(scooter)
         step(throttle, brake)
         drawn.extend((scooter.current, scooter.voltage))
-        if not done % every:
+        if not done % row_every:
             rows.append((*states(scooter), wanted))
             at.append(done)
             if progress and not done % (100 * every):
@@ -171,19 +178,24 @@ def drive(
         if until_empty and (scooter.voltage <= cutoff or scooter.pack.soc <= 0.0):
             empty = True
             break
-    if done % every:
+    if done % row_every:
         rows.append((*states(scooter), wanted))
         at.append(done)
     current, voltage = np.frombuffer(drawn).reshape(-1, 2).T
     energy = np.cumsum(current * voltage) * dt
     columns = dict(zip((*_STATES, "wanted_speed"), np.array(rows, dtype=float).T, strict=True), energy=energy[at])
-    series = {name: columns[name] for name in COLUMNS}
+    steps = {name: columns[name] for name in COLUMNS}
+    series = steps
+    if keep_steps:
+        sampled = [*range(0, done, every), done]
+        series = {name: column[sampled] for name, column in steps.items()}
     if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
         series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
     gained = {"kinetic_energy": scooter.kinetic_energy() - kinetic, "potential_energy": scooter.potential_energy()}
     charge = float(current.sum())
     return Run(
         series=series,
+        steps=steps if keep_steps else None,
         ledger={**scooter.ledger, **gained},
         chemical=scooter.pack.chemical_energy_drawn(),
         energy=float(energy[-1]),

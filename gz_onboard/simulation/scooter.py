@@ -29,7 +29,7 @@ from gz_onboard.simulation.parts import (
     RoadProfile,
     straight,
 )
-from gz_onboard.simulation.turning import STRAIGHT_ON, Chassis, StraightChassis
+from gz_onboard.simulation.turning import STRAIGHT_ON, Chassis
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.01  # s
@@ -156,9 +156,9 @@ class Scooter:
     def _build_mechanic(self, options: Options) -> None:
         """Chassis, tyre, brakes and the forces of the road."""
         model, p, roller = self.vehicle.model, self.vehicle.parameters, self.dynamometer
-        self.chassis: Chassis = options.get("chassis") or StraightChassis()
-        for effect in model.effects if self.chassis.name != "straight" else ():
-            if traits(effect).turning_loss:
+        self.chassis = options.get("chassis")
+        for effect in model.effects:
+            if self.chassis and traits(effect).turning_loss:
                 raise self.vehicle.error(
                     f"model.effects lists {effect.name}, and the {self.chassis.name} chassis has the same loss: "
                     "it would count twice; take one of them"
@@ -175,7 +175,6 @@ class Scooter:
         self._forces, self._rolling = stepper(forces, self.dt), stepper(rolling, self.dt)
         self._radius, self._gear, self._gear_efficiency = p["wheel_radius"], p["gear_ratio"], p["gear_efficiency"]
         self._weight = model.mass * GRAVITY
-        self._turns = self.chassis.name != "straight" and not roller
         self._turn = STRAIGHT_ON
         self._rear_share = 1 - p["cg_to_rear"] / p["wheelbase"]
         self._lever = p["cg_height"] / p["wheelbase"]
@@ -198,6 +197,11 @@ class Scooter:
     def grade(self) -> float:
         """Sine of the road's angle; 0 on a roller."""
         return 0.0 if self.dynamometer else self.road(self.distance)[0]
+
+    @property
+    def curvature(self) -> float:
+        """Of the road [1/m], positive left; 0 on a roller."""
+        return 0.0 if self.dynamometer else self.road(self.distance)[1]
 
     @property
     def motor_speed(self) -> float:
@@ -303,7 +307,7 @@ class Scooter:
         if self._tracks:
             self._track(curvature)
         normal = self._weight * cosine
-        if self._turns:
+        if self.chassis:
             turn = self._turn = self.chassis.turn(v, curvature, self.dt)
             turning = turn.resistance * normal * direction(v)
             radius *= turn.radius

@@ -1,6 +1,6 @@
 """Readings of the reference scooter's sensors in a simulated ride: with gain, offset, noise and delay.
 
-`trace` keeps the scooter's states; `SENSORS` gives the sensor of each signal of the scooter's DBC files.
+`Truth` has the states of the scooter; `SENSORS` gives the sensor of each signal of the scooter's DBC files.
 Figures are those of docs/reference/reference-scooter.md, or guesses where that has none.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.model.sensors import VIBRATION_PERIOD_S
-from gz_onboard.simulation.trace import Truth
+from gz_onboard.simulation.truth import Truth
 
 BAR = 1e5  # Pa
 BMS_DELAY = 0.10  # s behind the inverter
@@ -46,14 +46,16 @@ def _column(name: str, factor: float = 1.0) -> Callable[[Truth], Array]:
 
 def _temperatures() -> list[SimulatedSensor]:
     places = {
-        "INV_Temperature": "inverter",
-        "INV_MotorTemperature": "motor",
-        "TC_Inverter1": "inverter",
-        "TC_Inverter2": "inverter",
-        "TC_Inverter3": "inverter",
+        "INV_Temperature": "inverter_temperature",
+        "INV_MotorTemperature": "motor_temperature",
+        "TC_Inverter1": "inverter_temperature",
+        "TC_Inverter2": "inverter_temperature",
+        "TC_Inverter3": "inverter_temperature",
     }
-    places |= {f"BMS_CellTemp{which}": "cell" for which in ("Min", "Max", "Mean")} | {"BMS_BoardTemp": "bms"}
-    places |= {f"TC_Pack{i}": "cell" for i in range(1, 7)}
+    places |= {f"BMS_CellTemp{which}": "cell_temperature" for which in ("Min", "Max", "Mean")} | {
+        "BMS_BoardTemp": "bms_temperature"
+    }
+    places |= {f"TC_Pack{i}": "cell_temperature" for i in range(1, 7)}
     sensors = [SimulatedSensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
     return sensors + [
         SimulatedSensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")

@@ -20,14 +20,13 @@ from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.reports.results import times, write_json
 from gz_onboard.simulation.frames import Dropouts, check_output, messages_sent
-from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
+from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_ride
 from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_plan, vehicle_on
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
-from gz_onboard.simulation.trace import Trace
 from gz_onboard.simulation.turning import MODELS, chassis
 from gz_onboard.vehicle import Vehicle, find_vehicle
 
@@ -110,11 +109,10 @@ def run(arguments: argparse.Namespace) -> int:
     endings = [*(() if arguments.no_series else [f".{arguments.format}"]), *(() if arguments.no_plot else pictures)]
     written = [arguments.frames, arguments.json, *(output_file(arguments, plan, ending) for ending in endings)]
     not_an_input(written, [Path(arguments.what), find_vehicle(arguments.vehicle)])
-    trace = Trace() if arguments.frames else None
     begin = time.perf_counter()
     expected = _expected_seconds(options, plan, sweeps)
     with progress_bar(lambda: expected, "s ridden", quiet=arguments.quiet) as display:
-        result, scooter = ride(vehicle, plan, options, display.update, trace)
+        result, scooter = ride(vehicle, plan, options, display.update, bool(arguments.frames))
         wall = time.perf_counter() - begin
         variants = (
             [variant(vehicle, values, plan, options, display.update) for values in grid(sweeps)] if sweeps else None
@@ -122,8 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
     found = summarise(vehicle, plan, arguments.what, result, scooter)
     found = replace(found, payload_from=payload_from, wall_s=wall, sweep=variants)
     files = write(arguments, vehicle, plan, result, found, sweeps)
-    if trace:
-        files.append(write_trace(arguments, vehicle, trace, scooter))
+    if arguments.frames:
+        files.append(write_ride(arguments, vehicle, result, scooter))
     summary = replace(found, files=files)
     write_json(arguments.json, SUMMARY_VERSION, summary)
     if arguments.json != "-":
@@ -132,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def ride(
-    vehicle: Vehicle, plan: Plan, options: SimulationOptions, progress: Progress | None, trace: Trace | None = None
+    vehicle: Vehicle, plan: Plan, options: SimulationOptions, progress: Progress | None, keep_steps: bool = False
 ) -> tuple[Run, Scooter]:
     """Ride `plan` with `options`; where these leave the start open, it is as recorded."""
     recorded, soc = plan.recorded, options.soc
@@ -152,8 +150,15 @@ def ride(
     seconds = _MOST_HOURS * HOUR if options.until_empty else plan.seconds * options.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
-    command = trace.watch(plan.command()) if trace else plan.command()
-    result = drive(scooter, command, seconds, until_empty=options.until_empty, finish=plan.length, progress=progress)
+    result = drive(
+        scooter,
+        plan.command(),
+        seconds,
+        until_empty=options.until_empty,
+        finish=plan.length,
+        progress=progress,
+        keep_steps=keep_steps,
+    )
     return result, scooter
 
 

@@ -15,6 +15,7 @@ from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, LOADED, BeyondBattery, Run, Shortfall, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.turning import STRAIGHT
 from gz_onboard.vehicle import Vehicle
 
 SUMMARY_VERSION = 1
@@ -153,8 +154,8 @@ def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Sco
         range_by_energy_km=times(range_by_energy(scooter, result), 1e-3),
         ledger_wh={name: energy / WH for name, energy in result.ledger.items()},
         closure=result.closure,
-        chassis=scooter.chassis.name,
-        turning_beyond_s=scooter.chassis.beyond,
+        chassis=scooter.chassis.name if scooter.chassis else STRAIGHT,
+        turning_beyond_s=scooter.chassis.beyond if scooter.chassis else 0.0,
         measured=compare(plan.recorded, result) if plan.recorded else None,
     )
 

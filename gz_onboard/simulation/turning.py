@@ -21,7 +21,7 @@ from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import asin, atan, cos, sin, sqrt, tan
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError, nearest
@@ -29,7 +29,8 @@ from gz_onboard.model.effects import aerodynamic_drag, rolling_resistance
 from gz_onboard.model.functions import STANDSTILL
 from gz_onboard.model.model import air_density
 
-MODELS = ("straight", "planar", "leaning")
+STRAIGHT = "straight"  # loses nothing in turns (Lord 2016, eqs. 3.1-3.7)
+MODELS = (STRAIGHT, "planar", "leaning")
 LEAN_TIME = 0.2  # s: lag of the lean behind the road
 TIGHTEST_M = 2.0  # radius of a scooter's smallest circle
 HARDEST = 8.0  # m/s²: 39 degrees on thin wheels, more than a scooter's stand clears
@@ -52,33 +53,14 @@ class Turn(NamedTuple):
 STRAIGHT_ON = Turn(0.0, 0.0, 1.0, 1.0, 0.0)
 
 
-class Chassis(Protocol):
-    """A chassis, as the scooter uses it."""
+class Chassis:
+    """A chassis that turns, as a table of steady turns. Lateral acceleration follows the road within `LEAN_TIME`."""
 
-    name: str
-    beyond: float  # s in which the road turned harder than the table goes
-
-    def turn(self, speed: float, curvature: float, dt: float) -> Turn:
-        """Return the turn after `dt` [s] on a road of `curvature` [1/m, positive left] at `speed` [m/s]."""
-
-
-class StraightChassis:
-    """A chassis that loses nothing in turns (Lord 2016, eqs. 3.1-3.7)."""
-
-    name = "straight"
-    beyond = 0.0
-
-    def turn(self, speed: float, curvature: float, dt: float) -> Turn:
-        """See `Chassis`."""
-        return STRAIGHT_ON
-
-
-class TurningChassis:
-    """A table of steady turns. Lateral acceleration follows the road within `LEAN_TIME`."""
-
-    def __init__(self, name: str, machine: TwoWheeler) -> None:
+    def __init__(self, name: str, parameters: Mapping[str, float]) -> None:
         self.name = name
-        self.beyond = 0.0
+        self.leans = name == "leaning"
+        machine = TwoWheeler(parameters, self.leans)
+        self.beyond = 0.0  # s in which the road turned harder than the table goes
         self.lateral = 0.0  # m/s², positive left
         grip = 0.8 * machine.side_friction * GRAVITY
         self._limits = [min(HARDEST, grip, speed * speed / TIGHTEST_M) for speed in SPEEDS]
@@ -88,7 +70,10 @@ class TurningChassis:
         ]
 
     def turn(self, speed: float, curvature: float, dt: float) -> Turn:
-        """See `Chassis`. Bilinear between the four nearest steady turns."""
+        """Return the turn after `dt` [s] on a road of `curvature` [1/m, positive left] at `speed` [m/s].
+
+        Bilinear between the four nearest steady turns.
+        """
         wanted = speed * abs(speed) * curvature
         self.lateral += (wanted - self.lateral) * min(dt / LEAN_TIME, 1.0)
         hard = abs(self.lateral)
@@ -112,11 +97,14 @@ class TurningChassis:
         return turn._replace(lean=-turn.lean) if self.lateral > 0 else turn
 
 
-def chassis(name: str, parameters: Mapping[str, float]) -> Chassis:
-    """Return the chassis of that name for a vehicle with these parameters; InputError for an unknown name."""
+def chassis(name: str, parameters: Mapping[str, float]) -> Chassis | None:
+    """Return the chassis of that name for a vehicle with these parameters; None if it loses nothing in turns.
+
+    InputError for an unknown name.
+    """
     if name not in MODELS:
         raise InputError(f"no chassis is called {name!r}; there are {', '.join(MODELS)}{nearest(name, MODELS)}")
-    return StraightChassis() if name == "straight" else TurningChassis(name, TwoWheeler(parameters, name == "leaning"))
+    return None if name == STRAIGHT else Chassis(name, parameters)
 
 
 @dataclass(frozen=True)

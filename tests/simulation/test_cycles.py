@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
@@ -65,19 +63,9 @@ def test_single_seconds_stand_where_the_regulation_has_them():
     assert [round(3.6 * v, 2) for v in cycle("ece15").speed[10:16]] == [0.0, 0.0, 3.75, 7.5, 11.25, 15.0]
 
 
-@given(st.sampled_from(names()), st.integers(1, 4))
-def test_repeating_multiplies_duration_and_distance(name, count):
-    once, often = cycle(name), cycle(name).repeated(count)
-    assert often.duration == count * once.duration
-    assert distance_of(often) == pytest.approx(count * distance_of(once))
-    assert often.speed[-31:] == once.speed[-31:]
-
-
-def test_repeating_refuses_a_jump_in_speed_and_no_times():
+def test_a_cycle_that_ends_at_another_speed_is_not_repeated():
     with pytest.raises(InputError, match=r"begins at 0\.00 m/s, the one before ends at 5\.00 m/s"):
-        Cycle("ramp", (0.0, 1.0), (0.0, 5.0), "", "").repeated(2)
-    with pytest.raises(InputError, match="0 times"):
-        cycle("ece15").repeated(0)
+        Cycle("ramp", (0.0, 1.0), (0.0, 5.0), "", "").check_closed()
 
 
 def write(folder: Path, text: str) -> Path:
@@ -139,9 +127,3 @@ def test_finding_by_name_or_file(tmp_path):
     for find in (find_cycle, cycle):
         with pytest.raises(InputError, match=r"did you mean 'wmtc_part1'\?"):
             find("wmtc_prt1")
-
-
-@pytest.mark.parametrize("name", ["wmtc_part2_reduced", "wmtc_part3_reduced", "wmtc_class2_1", "wmtc_class3_1"])
-def test_cycles_without_a_table_say_so(name):
-    with pytest.raises(InputError, match=r"is not built in: no table of .* speed.* was at hand"):
-        find_cycle(name)

@@ -14,7 +14,7 @@ from gz_onboard.simulation.parts import Dynamometer, FirstOrderPack, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, latency
-from gz_onboard.simulation.trace import Trace
+from gz_onboard.simulation.truth import Truth
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.support import joined, without_cell_effects
 
@@ -189,10 +189,8 @@ def _cycle() -> tuple[Any, Any]:
 
 def test_what_the_sensors_show_of_it():
     def signals(vehicle):
-        trace = Trace()
         scooter = Scooter(vehicle, straight(), soc=0.8)
-        drive(scooter, trace.watch(stop_and_go), 20.0)
-        truth = trace.truth(scooter)
+        truth = Truth(drive(scooter, stop_and_go, 20.0, keep_steps=True), scooter)
         return {sensor.signal: sensor.read(truth) for sensor in SENSORS}
 
     true = signals(BASE)

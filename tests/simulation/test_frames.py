@@ -19,7 +19,7 @@ from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_f
 from gz_onboard.simulation.parts import Dynamometer, road_table
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.trace import Trace
+from gz_onboard.simulation.truth import Truth
 from gz_onboard.vehicle import read_vehicle
 from tests.events import events_of
 from tests.support import ROOT, reference, ridden
@@ -35,10 +35,9 @@ def ride():
         [0.0, 400.0, 500.0, 700.0, 1000.0], [0.0, 0.0, 0.0, sin(atan(0.03)), 0.0], [0.0, 1 / 60, 0.0, 0.0, 0.0]
     )
     scooter = Scooter(reference(), road, soc=0.8)
-    trace = Trace()
     metres = [10.0] * 5000
-    run = drive(scooter, trace.watch(along(metres)), SECONDS)
-    return run, trace.truth(scooter)
+    run = drive(scooter, along(metres), SECONDS, keep_steps=True)
+    return run, Truth(run, scooter)
 
 
 def frames(seed=1, dropouts=NONE):
@@ -155,9 +154,8 @@ def test_lost_frames_show_in_the_counters_and_change_no_other():
 
 def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
     scooter = Scooter(reference(), Dynamometer(180.0, 5.0, 0.3, 0.27), soc=0.8)
-    trace = Trace()
-    drive(scooter, trace.watch(along([10.0] * 500)), 20.0)
-    sent = {s.message: s for s in simulate_frames(reference(), trace.truth(scooter), dropouts=NONE)}
+    run = drive(scooter, along([10.0] * 500), 20.0, keep_steps=True)
+    sent = {s.message: s for s in simulate_frames(reference(), Truth(run, scooter), dropouts=NONE)}
     codec = Codec(reference().mapping)
 
     def decoded(name):

@@ -22,6 +22,7 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.turning import (
     HARDEST,
     MODELS,
+    Chassis,
     TwoWheeler,
     chassis,
     front_camber,
@@ -151,7 +152,7 @@ def test_straight_on_all_chassis_are_alike():
 
 
 def test_beyond_the_table_its_edge_is_taken_and_the_time_reported():
-    part = chassis("leaning", P)
+    part = Chassis("leaning", P)
     for _ in range(500):
         edge = part.turn(10.0, HARDEST / 100, 0.01)
     assert part.beyond == 0

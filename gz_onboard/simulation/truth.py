@@ -1,10 +1,6 @@
-"""The true states of a simulated ride, kept before each step, and what follows from them."""
+"""The true states of a simulated ride at each step, and what follows from them."""
 
 from __future__ import annotations
-
-from array import array
-from collections.abc import Mapping
-from operator import attrgetter
 
 import numpy as np
 
@@ -13,67 +9,31 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.model.effect import MOVING, Port
 from gz_onboard.model.model import Bound
 from gz_onboard.model.series import all_quantities, over, total
-from gz_onboard.simulation.run import Command
+from gz_onboard.simulation.run import Run
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.turning import lean_of
 
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
-_ALIKE = "time speed wheel_speed distance climb throttle brake motor_current vibration"
-_STATES = {name: name for name in _ALIKE.split()} | {
-    "pack_current": "current",
-    "pack_voltage": "voltage",
-    "tyre_force": "force",
-    "chassis_lean": "lean",
-    "soc": "pack.soc",
-    "cell": "pack_cooling.temperature",
-    "bms": "bms_cooling.temperature",
-    "motor": "motor_cooling.stator",
-    "inverter": "inverter_cooling.board",
-}
-"""What is kept of a scooter, by name: the attribute that has it."""
-_NAMES = ("grade", "curvature", *_STATES)
-
-
-class Trace:
-    """The state of a scooter before each step of a ride; pass `run.drive` what `watch` gives."""
-
-    def __init__(self) -> None:
-        self._rows = array("d")
-
-    def watch(self, command: Command) -> Command:
-        """`command`, with the state that it is given kept."""
-        extend, states = self._rows.extend, attrgetter(*_STATES.values())
-
-        def watched(s: Scooter) -> tuple[float, float, float]:
-            grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
-            extend((grade, curvature, *states(s)))
-            return command(s)
-
-        return watched
-
-    def truth(self, scooter: Scooter) -> Truth:
-        """What there was to be sensed on the ride of `scooter`; ValueError if nothing was ridden."""
-        if len(self._rows) < 3 * len(_NAMES):
-            raise ValueError("a trace of fewer than three steps")
-        columns = np.frombuffer(self._rows).reshape(-1, len(_NAMES)).T
-        return Truth(dict(zip(_NAMES, columns, strict=True)), scooter)
 
 
 class Truth:
     """Everything that the sensors read, as arrays over the steps; SI units, temperatures in degC, angles in rad.
 
-    Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
-    ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `lean_of`), ``lean_rate``, ``pitch_rate``
-    (nose down), ``heading`` (from north), ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC
-    link), ``auxiliary_current``. ``vibration`` is 0 unless the model reads it.
+    Columns of a `Run` that kept its steps (ValueError if it did not), each before its step, and ``acceleration`` and
+    ``way`` (of the body over the ground: none on a dynamometer), ``yaw_rate`` (left), ``lean`` (right; of a leaning
+    chassis its own, else `lean_of`), ``lean_rate``, ``pitch_rate`` (nose down), ``heading`` (from north), ``north`` and
+    ``east`` [m], ``auxiliary_power`` (of all effects at the DC link), ``auxiliary_current``. ``vibration`` is 0 unless
+    the model reads it.
     """
 
-    def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
+    def __init__(self, run: Run, scooter: Scooter) -> None:
+        if run.steps is None:
+            raise ValueError("the run has not kept its steps")
         self.parameters = scooter.vehicle.parameters
         self.ambient = scooter.ambient
         self.on_dynamometer = scooter.dynamometer is not None
         self.dt = dt = scooter.dt
-        self.columns = c = dict(columns)
+        self.columns = c = {name: column[:-1] for name, column in run.steps.items()}
         self.count = len(c["time"])
         moving = 0.0 if self.on_dynamometer else 1.0
         c["way"] = moving * c["speed"]
@@ -81,8 +41,8 @@ class Truth:
         width = min(2 * round(LEAN_TIME / dt / 2) + 1, self.count)
         curvature = running_mean(c["curvature"], width)
         c["yaw_rate"] = c["way"] * curvature
-        if scooter.chassis.name == "leaning":
-            c["lean"] = running_mean(c["chassis_lean"], width)
+        if scooter.chassis and scooter.chassis.leans:
+            c["lean"] = running_mean(c["lean"], width)
         else:
             # Nobody leans on a chassis without lean; its sensors are those of one that does.
             crown, height = self.parameters["tyre_crown_radius"], self.parameters["cg_height"]
@@ -108,8 +68,8 @@ class Truth:
             lateral_acceleration=c["way"] * c["yaw_rate"],
             heading=c["heading"],
             motor_current=c["motor_current"],
-            motor_temperature=c["motor"],
-            cell_temperature=c["cell"],
+            motor_temperature=c["motor_temperature"],
+            cell_temperature=c["cell_temperature"],
             time_moving=np.cumsum(c["way"] > MOVING) * self.dt,
             ambient_temperature=self.ambient,
             vibration=c["vibration"],
