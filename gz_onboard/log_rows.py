@@ -94,7 +94,7 @@ TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
 class Log(Protocol):
     """A log that the pipeline writes to; implemented by `gz_onboard.can.logfile` and `recorder`."""
 
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+    def channel(self, topic: str, json_schema: Mapping[str, Any]) -> None:
         """Declare a topic of JSON objects."""
 
     def frames(self, batch: Sequence[Frame]) -> None:

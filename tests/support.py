@@ -221,7 +221,7 @@ class Run:
         self.samples: list[tuple[str, int, Mapping[str, Any]]] = []
         self.pipeline = Pipeline(vehicle or reference(), log=self, observer=self.estimates.append)
 
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+    def channel(self, topic: str, json_schema: Mapping[str, Any]) -> None:
         """Every topic is taken."""
 
     def frames(self, batch: Sequence[Frame]) -> None:

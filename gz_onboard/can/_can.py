@@ -10,7 +10,7 @@ import os
 import socket
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -75,20 +75,18 @@ def _os_errors() -> Iterator[None]:
 class LibraryBus:
     """An open bus. InputError for an unknown interface, OSError for a bus that is down.
 
-    identifiers: the only ones to be received, if given; options: for python-can.
+    identifiers: the only ones to be received, if given.
     """
 
-    def __init__(
-        self, interface: str, channel: str, identifiers: Sequence[int] | None, options: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, interface: str, channel: str, identifiers: Sequence[int] | None) -> None:
         check_interface(interface)
         self.overflow = 0
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
-        self._echoing = interface == MULTICAST or bool(options.get("receive_own_messages"))
+        self._echoing = interface == MULTICAST
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=MAX_ECHOES)  # frames of our own that will come back
         try:
             with _os_errors():
-                self._bus: Any = open_bus(interface, channel, **options)
+                self._bus: Any = open_bus(interface, channel)
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
             raise InputError(f"--interface {interface}: {error}") from error
 

@@ -15,7 +15,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
@@ -157,16 +157,13 @@ class SocketCanBus:
 class CanChannel:
     """One channel. index: is put into its frames; identifiers: the only ones to be received, if given."""
 
-    def __init__(
-        self, interface: str, channel: str, index: int = 0, identifiers: Sequence[int] | None = None, **options: Any
-    ) -> None:
+    def __init__(self, interface: str, channel: str, index: int = 0, identifiers: Sequence[int] | None = None) -> None:
         self.interface = interface
         self.name = channel
         self.index = index
         self.behind = False  # whether `drain` had no time for all frames
         self.send_failures = 0
         self._identifiers = identifiers
-        self._options = options  # for python-can
         self._bus: SocketCanBus | LibraryBus | None = None
         self._overflow = 0  # of buses that were closed
         self._retry_at = 0.0
@@ -196,7 +193,7 @@ class CanChannel:
         else:
             from gz_onboard.can._can import LibraryBus  # only here: a slow import
 
-            self._bus = LibraryBus(self.interface, self.name, self._identifiers, self._options)
+            self._bus = LibraryBus(self.interface, self.name, self._identifiers)
 
     def close(self) -> None:
         """Close the bus; `drain` opens it again, `RETRY_S` later."""

@@ -24,6 +24,7 @@ from gz_onboard.events import Frame
 from gz_onboard.state import sync_directory
 
 _NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d{1,9}))?\.mcap")
+MAX_WAITING = 40_000  # frames for the disk; each value of a sample counts as one
 _STUCK_S = 10.0  # no disk takes as long
 PORTION_NS = 450_000_000  # between two portions that the thread gets: every fifth tick, also if one comes early
 _LEFT_FREE = 64 << 20  # bytes
@@ -80,7 +81,7 @@ class Recorder:
         self._vehicle = re.sub(r"[^\w.+-]+", "-", vehicle) or "vehicle"
         self._metadata = {"vehicle": vehicle, **(metadata or {})}
         self._attachments = dict(attachments or {})
-        self._channels: dict[str, tuple[Mapping[str, Any], Mapping[str, str]]] = {}
+        self._channels: dict[str, Mapping[str, Any]] = {}
         self._limits = limits
         self._retry_ns = round(limits.retry_s * 1e9)
         self._file_bytes = limits.max_file_bytes
@@ -99,11 +100,9 @@ class Recorder:
         """Whether the last attempt to write failed, and none has succeeded since."""
         return self._failed_ns is not None
 
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """Declare a topic of JSON objects (a JSON schema of type object), for this file and all later ones."""
-        self._channels[topic] = (json_schema, dict(metadata or {}))
-        if self._file is not None:
-            self._file.channel(topic, *self._channels[topic])
+    def channel(self, topic: str, json_schema: Mapping[str, Any]) -> None:
+        """Declare a topic of JSON objects (a JSON schema of type object), for all files; before the first of them."""
+        self._channels[topic] = json_schema
 
     def frames(self, batch: Sequence[Frame]) -> None:
         """Log raw frames, in the order received."""
@@ -180,8 +179,8 @@ class Recorder:
         lock(self._stream)
         sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
         file = LogFile(self._stream, start_ns, self._metadata, self._attachments)
-        for topic, (schema, metadata) in self._channels.items():
-            file.channel(topic, schema, metadata)
+        for topic, schema in self._channels.items():
+            file.channel(topic, schema)
         self._synced_ns, self._failed_ns, self._file = start_ns, None, file
         return file
 
@@ -264,20 +263,20 @@ class BackgroundRecorder:
     """Runs a `Recorder` on its own thread, so that the caller never waits for the disk.
 
     What is logged is handed over at `sync`, twice a second and all at once: waking the thread costs as much as a
-    hundred frames. limit: how many frames may wait for the disk (each value of a sample counts as one). Beyond it a
-    whole portion is dropped, and its frames are counted in `lost_frames`. Nobody else may use the recorder.
+    hundred frames. Beyond `MAX_WAITING` a whole portion is dropped, and its frames are counted in `lost_frames`. Nobody
+    else may use the recorder.
     """
 
-    def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
+    def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._thread = Background("log", limit)
+        self._thread = Background("log", MAX_WAITING)
         self._dropped_frames = 0
         self._is_full = False
         self._frames: list[Frame] = []  # since they were last handed over
         self._samples: list[tuple[str, int, Mapping[str, object], int | None]] = []
         self._handed_ns = 0
         self.channel = recorder.channel
-        """As `Recorder.channel`; call it before anything is logged."""
+        """As `Recorder.channel`."""
 
     @property
     def error(self) -> str:

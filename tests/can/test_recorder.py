@@ -52,7 +52,7 @@ def flat(batches: list[list[Frame]]) -> list[Frame]:
 
 def test_another_mcap_reader_finds_topics_schemas_and_json(tmp_path: Path) -> None:
     log = Recorder(tmp_path, "reference", attachments={"a.dbc": b"text"})
-    log.channel("/estimate", SCHEMA, {"rate": "1 Hz"})
+    log.channel("/estimate", SCHEMA)
     batches = ticks(3)
     for i, batch in enumerate(batches):
         log.frames(batch)
@@ -69,7 +69,7 @@ def test_another_mcap_reader_finds_topics_schemas_and_json(tmp_path: Path) -> No
         schema, channel, message = found[1]
         assert schema is not None
         assert (schema.name, schema.encoding, json.loads(schema.data)) == ("Estimate", "jsonschema", SCHEMA)
-        assert (channel.message_encoding, channel.metadata) == ("json", {"rate": "1 Hz"})
+        assert channel.message_encoding == "json"
         assert message.log_time == batches[50][0][0]
         blocks = [message.data for _, _, message in reader.iter_messages(logfile.FRAMES_TOPIC)]
         assert [frame for block in blocks for frame in decode_block(block).tuples()] == flat(batches)

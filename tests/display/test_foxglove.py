@@ -76,7 +76,7 @@ class Kept:
         self.of: dict[str, Any] = {}
         self.rows: dict[str, list[Any]] = {}
 
-    def channel(self, topic: str, json_schema: Any, metadata: Any = None) -> None:
+    def channel(self, topic: str, json_schema: Any) -> None:
         self.of[topic] = json_schema
 
     def frames(self, batch: Any) -> None:
