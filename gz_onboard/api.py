@@ -61,7 +61,7 @@ from gz_onboard.simulation.sweep import Sweep, grid, sweep_of
 from gz_onboard.validation.comparison import ValidatedRide
 from gz_onboard.validation.ride import compare_ride
 from gz_onboard.validation.tables import markdown, ride_text
-from gz_onboard.vehicle import Vehicle, find_vehicle
+from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.check import Checked, RoleSeen, check_log, check_text
 from gz_onboard.vehicle_check.command import roles_text
 from gz_onboard.vehicle_check.finding import Feature, Finding, Looks, features_of
@@ -673,18 +673,10 @@ def calibrate(
     slots, such as ``{"data": [...], "held_out": [...]}``. vehicle: name or file to start from, ``reference`` or that
     of the manifest if None. progress: takes each part of the work that begins. Raises InputError.
     """
-    calibration.check_procedure(procedure)
     slots = data if isinstance(data, Mapping) else {"data": _paths(data)}
     files = {slot: _paths(group) for slot, group in slots.items()}
-    start = None if vehicle is None else _file(vehicle)
-    if procedure == "all":
-        if options:
-            raise InputError("the procedure all takes its options from the manifest")
-        base, steps = calibration.read_manifest(files.get("data", []), start)
-    else:
-        base = find_vehicle("reference" if start is None else start)
-        texts = [f"{name}={value}" for name, value in (options or {}).items()]
-        steps = [calibration.step_of(procedure, files, texts)]
+    texts = [f"{name}={value}" for name, value in (options or {}).items()]
+    base, steps = calibration.requested(procedure, files, texts, None if vehicle is None else _file(vehicle))
     found = calibration.run_steps(steps, base, progress or (lambda _: None))
     return Calibration(base, [result for result, _ in found], calibration.files_of(steps, files.get("data", [])))
 

@@ -16,26 +16,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations
+from itertools import permutations
 from math import sqrt
 from typing import Any
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.calibration.fit import Solution, correlation, linear, score
+from gz_onboard.calibration.fit import Solution, linear, score
 from gz_onboard.calibration.result import Fit, Found, Panel, PlotLine, Result
-from gz_onboard.calibration.table import Measurements
 from gz_onboard.constants import GRAVITY
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError
 from gz_onboard.model.effect import ROAD_LOAD, Port
 from gz_onboard.model.effects.inertia import rotating_mass
 from gz_onboard.model.model import Bound, air_density
 from gz_onboard.model.series import all_quantities, total
 from gz_onboard.priors import correlations
-from gz_onboard.recording.recording import Recording, read_facts
+from gz_onboard.recording.recording import Recording
 from gz_onboard.recording.sensors import road_speed, speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
@@ -57,7 +56,6 @@ class CoastdownConfig:
     speed_sd: float = 1e-3  # s/m: no tyre's rolling resistance grows faster (SAE J2452)
     entered_mass_sd: float = 1.0  # kg: of a rider who was weighed, with clothes
     density_sd: float = 0.015  # relative: of weather's pressure and of the thermometer
-    strongest_wind: float = 8.0  # m/s, in which nobody coasts down
 
 
 COASTDOWN = CoastdownConfig()
@@ -65,11 +63,6 @@ NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
 UNITS = dict(zip(NAMES, ("1", "s/m", "m²"), strict=True))
 START = {"rolling_resistance_constant": 0.012, "rolling_resistance_speed": 0.0, "drag_area": 0.5}
 _STEP = {"rolling_resistance_constant": 1e-4, "rolling_resistance_speed": 1e-5, "drag_area": 1e-3, "slope": 1e-5}
-_MEASURED = (
-    "vehicle_speed motor_speed wheel_speed_rear throttle brake_switch motor_current ambient_temperature gps_altitude "
-    "gps_course"
-)
-_ROLES = {"speed": "vehicle_speed"} | {role: role for role in _MEASURED.split()}  # by column
 
 
 def coast_downs(
@@ -96,7 +89,7 @@ def coast_downs(
     signs = directions(runs)
     coasts = [coast(run, vehicle, sign) for run, sign in zip(runs, signs, strict=True)]
     result, fit = Result("coastdown"), RoadFitter(coasts, vehicle, wind_sd, slope_sd)
-    best, covariance, shares = _fitted(fit, result)
+    best, covariance = _fitted(fit, result)
     both = len(set(signs)) == 2
     if not both:
         together = best.value[NAMES[0]] + signs[0] * best.value["slope"]
@@ -106,14 +99,6 @@ def coast_downs(
             f"± {sqrt(covariance[0, 0]):.4f} only (the slope's prior, ± {slope_sd:g}); coast down the other way too"
         )
     _report(result, fit, best, NAMES if both else NAMES[1:], covariance)
-    largest = sorted(shares.items(), key=lambda item: -abs(item[1]))[:4]
-    result.notes.append(
-        f"part of the sd of drag_area from what was taken as given: "
-        f"{', '.join(f'{name} {abs(share):.4f}' for name, share in largest)} m²"
-    )
-    r = correlation(covariance)
-    pairs = [f"{NAMES[i]} and {NAMES[j]} {r[i, j]:+.2f}" for i, j in combinations(range(len(NAMES)), 2)]
-    result.notes.append(f"correlations: {', '.join(pairs)}")
     if hold_out and len(coasts) > 2:
         result.fits += _held_out(fit, best.held)
     return result
@@ -125,7 +110,8 @@ def _report(result: Result, fit: RoadFitter, road: RoadFit, names: Sequence[str]
     force = RoadLoad(fit.vehicle, value)
     speeds = [roll(force, run, value["slope"], value[f"wind {run.name}"]) for run in runs]
     data, model = np.concatenate([run.speed for run in runs]), np.concatenate(speeds)
-    scored = score("speed, coasting, own wind", "m/s", data, model, held_out=False, source=_names(runs))
+    names_of_runs = ", ".join(run.name for run in runs)
+    scored = score("speed, coasting, own wind", "m/s", data, model, held_out=False, source=names_of_runs)
     result.fits.append(scored)
     cold, warm = min(run.temperature for run in runs), max(run.temperature for run in runs)
     ups = [run.name for run in runs if run.direction > 0]
@@ -168,38 +154,32 @@ def _report(result: Result, fit: RoadFitter, road: RoadFit, names: Sequence[str]
     ]
 
 
-def _names(runs: Sequence[Coast]) -> str:
-    return ", ".join(run.name for run in runs)
-
-
 def _held_out(fit: RoadFitter, held: Mapping[str, float]) -> list[Fit]:
-    """Each pair of runs, one each way, followed by a fit of the others: with its own wind free, and at no wind."""
-    runs = fit.runs
-    by_direction = [[run for run in runs if run.direction == sign] for sign in (1, -1)]
+    """Each pair of runs, one each way, followed at no wind by a fit of the others."""
+    by_direction = [[run for run in fit.runs if run.direction == sign] for sign in (1, -1)]
     both = all(by_direction)
-    pairs = list(zip(*by_direction, strict=False)) if both else [(run,) for run in runs]
-    rows = []
+    pairs = list(zip(*by_direction, strict=False)) if both else [(run,) for run in fit.runs]
+    measured, modelled = [], []
     for pair in pairs:
-        rest = [run for run in runs if run.name not in [other.name for other in pair]]
+        rest = [run for run in fit.runs if run not in pair]
         if not rest or (both and len({run.direction for run in rest}) < 2):
             continue
         road = replace(fit, runs=rest).fit(held)
-        force, slope = RoadLoad(fit.vehicle, road.value), road.value["slope"]
-        rows += [(run.speed, *(roll(force, run, slope, w) for w in (own_wind(force, run, slope), 0.0))) for run in pair]
-    if not rows:
+        force = RoadLoad(fit.vehicle, road.value)
+        for run in pair:
+            measured.append(run.speed)
+            modelled.append(roll(force, run, road.value["slope"], 0.0))
+    if not measured:
         return []
-    source = f"one {'pair' if both else 'run'} at a time left out of {_names(runs)}"
-    measured, free, still = (np.concatenate(column) for column in zip(*rows, strict=True))
-    return [
-        score("speed, own wind free", "m/s", measured, free, held_out=True, source=source),
-        score("speed, no wind", "m/s", measured, still, held_out=True, source=source),
-    ]
+    data, model = np.concatenate(measured), np.concatenate(modelled)
+    source = f"one {'pair' if both else 'run'} at a time left out of {', '.join(run.name for run in fit.runs)}"
+    return [score("speed, no wind", "m/s", data, model, held_out=True, source=source)]
 
 
 # --- runs ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Coast:
     """The part of a run in which the vehicle rolls, in spans.
 
@@ -223,31 +203,6 @@ class Coast:
     def slowing(self) -> Array:
         """Deceleration over the spans [m/s²]."""
         return np.asarray(-np.diff(self.speed) / np.diff(self.time))
-
-
-def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Recording:
-    """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
-
-    facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or
-    ``down``, or any two words), ``rider_mass_kg`` or ``total_mass_kg``, and ``ambient_C`` if there is no column
-    ambient_temperature. Raises InputError naming file, line and column.
-    """
-    time = table["time"]
-    again = np.flatnonzero(np.diff(time) <= 0)
-    if len(again):
-        raise table.error(f"time: {time[again[0] + 1]:g} s does not increase", int(again[0]) + 1)
-    if "motor_speed" not in table and "vehicle_speed" not in table:
-        table["speed"]  # which is missing, or of no use
-    name = table.file.name.removesuffix(".gz").rpartition(".")[0]
-    notes = table.file.parent / "rides.json"
-    known = dict(read_facts(notes).get(name, {}) if facts is None else facts)
-    for keys in (("direction",), ("total_mass_kg", "rider_mass_kg")):
-        if not known.keys() & set(keys):
-            close = nearest(keys[0], [str(key) for key in known])
-            raise table.error(f"{notes.name} beside it says no {' or '.join(keys)} of {name!r}{close}")
-    if "ambient_temperature" not in table and "ambient_C" not in known:
-        raise table.error(f"no column ambient_temperature, and {notes.name} beside it says no ambient_C of {name!r}")
-    return Recording(name, {role: (time, table[column]) for column, role in _ROLES.items() if column in table}, known)
 
 
 def coast(run: Recording, vehicle: Vehicle, direction: int) -> Coast:
@@ -433,17 +388,6 @@ def roll(force: RoadLoad, run: Coast, slope: float, wind: float) -> Array:
     return speed
 
 
-def own_wind(force: RoadLoad, run: Coast, slope: float) -> float:
-    """The constant headwind [m/s] with which `run` is followed best."""
-    best = minimize_scalar(
-        lambda wind: float(np.sum((roll(force, run, slope, wind) - run.speed) ** 2)),
-        bounds=(-COASTDOWN.strongest_wind, COASTDOWN.strongest_wind),
-        method="bounded",
-        options={"xatol": 0.01},
-    )
-    return float(best.x)
-
-
 # --- the fit -------------------------------------------------------------------------------------------------------
 
 
@@ -573,8 +517,8 @@ class RoadFitter:
         best = minimize(minus_log, x0, method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.1, "maxiter": 120})
         return CoastdownNoise(*np.exp(best.x).tolist())
 
-    def covariance(self, road: RoadFit, about: RoadFit) -> tuple[Array, dict[str, float]]:
-        """(covariance of `NAMES` with what else is not known well; the share of each of these in the sd of drag area).
+    def covariance(self, road: RoadFit, about: RoadFit) -> Array:
+        """The covariance of `NAMES`, with that of what else is not known well.
 
         Mass, inertia, radius, the motor's own drag and air density are taken as given in the fit. What they shift, were
         they one sd off, is added: -(X'X)⁻¹·X'·D, with D the derivative of the deceleration by them, about `about`.
@@ -582,24 +526,16 @@ class RoadFitter:
         p, value, solution = self.vehicle.parameters, about.value, road.solution
         base = {name: value[name] for name in NAMES}
         effects = [e for e in self.vehicle.model.effects if e.port is Port.MOTOR_LOSS]
-        given = [
-            "wheel_inertia_front",
-            "wheel_inertia_rear",
-            "wheel_radius",
-            *(n for e in effects for n in e.term.parameters),
-        ]
-        given = [name for name in dict.fromkeys(given) if p.sd(name) > 0]
+        motor = [name for effect in effects for name in effect.term.parameters]
+        names = dict.fromkeys(("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius", *motor))
+        given = [name for name in names if p.sd(name) > 0]
         here = RoadLoad(self.vehicle, base)
         heavier = sqrt(p.sd("vehicle_mass") ** 2 + COASTDOWN.entered_mass_sd**2)
         # Force, factor on the air's density, factor on the deceleration: a larger wheel has been faster.
-        moved = [
-            (
-                RoadLoad(self.vehicle, base | {n: p[n] + p.sd(n)}),
-                1.0,
-                1 + (p.sd(n) / p[n] if n == "wheel_radius" else 0),
-            )
-            for n in given
-        ]
+        moved = []
+        for name in given:
+            faster = 1 + p.sd(name) / p[name] if name == "wheel_radius" else 1.0
+            moved.append((RoadLoad(self.vehicle, base | {name: p[name] + p.sd(name)}), 1.0, faster))
         moved += [(RoadLoad(self.vehicle, base, heavier), 1.0, 1.0), (here, 1 + COASTDOWN.density_sd, 1.0)]
         rows = []
         for run, block in zip(self.runs, self._linearised(value, solution.names, road.noise.gust), strict=True):
@@ -614,24 +550,22 @@ class RoadFitter:
         for (i, a), (j, b) in permutations(enumerate(given), 2):
             matrix[i, j] = tied.get(frozenset((a, b)), 0.0)
         index = [solution.names.index(name) for name in NAMES]
-        covariance = solution.part(NAMES) + (shift @ matrix @ shift.T)[np.ix_(index, index)]
-        shares = zip([*given, "mass", "air density"], shift[index[-1]].tolist(), strict=True)
-        return covariance, dict(shares)
+        return np.asarray(solution.part(NAMES) + (shift @ matrix @ shift.T)[np.ix_(index, index)])
 
 
-def _fitted(fit: RoadFitter, result: Result) -> tuple[RoadFit, Array, dict[str, float]]:
-    """(the fit, covariance of `NAMES`, shares of what was taken as given in the sd of drag area).
+def _fitted(fit: RoadFitter, result: Result) -> tuple[RoadFit, Array]:
+    """(the fit, covariance of `NAMES`).
 
     Rolling resistance is held independent of speed, with a refusal, where that cannot be separated from drag.
     """
     free = fit.fit({})
-    covariance, shares = fit.covariance(free, free)
+    covariance = fit.covariance(free, free)
     drag = free.value["drag_area"]
     if free.value[NAMES[1]] >= 2 * sqrt(covariance[1, 1]) and drag > 0:
-        return free, covariance, shares
+        return free, covariance
     best = fit.fit({NAMES[1]: 0.0}, free.noise)
     wide = fit.fit({}, free.noise, best)
-    covariance, shares = fit.covariance(wide, best)
+    covariance = fit.covariance(wide, best)
     speed_term, speed_sd = wide.value[NAMES[1]], sqrt(covariance[1, 1])
     tie = covariance[:, 1] / covariance[1, 1]
     # About the value that is held, not about the most likely one: its distance counts as an error too.
@@ -641,4 +575,4 @@ def _fitted(fit: RoadFitter, result: Result) -> tuple[RoadFit, Array, dict[str, 
         f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m is indistinguishable from "
         f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"
     )
-    return best, covariance, shares
+    return best, covariance

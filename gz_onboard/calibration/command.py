@@ -8,22 +8,13 @@ from pathlib import Path
 from gz_onboard.calibration import report
 from gz_onboard.calibration.procedures import PROCEDURES
 from gz_onboard.calibration.result import Result
-from gz_onboard.calibration.steps import (
-    MANIFEST,
-    Step,
-    check_procedure,
-    files_of,
-    read_manifest,
-    run_steps,
-    step_of,
-    write_calibration,
-)
+from gz_onboard.calibration.steps import MANIFEST, Step, files_of, requested, run_steps, write_calibration
 from gz_onboard.calibration.vehicle_file import vehicle_output
 from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
 from gz_onboard.reports.results import write_json
-from gz_onboard.vehicle import find_vehicle, read_vehicle
+from gz_onboard.vehicle import read_vehicle
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run ``gz-onboard calibrate``; `OK` also where something was refused with its reason."""
-    check_procedure(arguments.what)
-    base, steps = _asked(arguments)
+    base, steps = _requested(arguments)
     for file in (arguments.output, arguments.report, arguments.json):
         if file is not None and str(file) != "-" and not Path(file).parent.is_dir():
             raise InputError(f"{file}: there is no folder {Path(file).parent}")
@@ -92,17 +82,12 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
+def _requested(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
     """(vehicle file to start from, steps) of a command line."""
-    if arguments.what == "all":
-        if arguments.more or arguments.set:
-            raise InputError("all takes its data and options from the manifest, not from --with or --set")
-        return read_manifest(arguments.data, arguments.vehicle)
     files: dict[str, list[Path]] = {"data": list(arguments.data)}
     for text in arguments.more:
         slot, equals, file = text.partition("=")
         if not equals:
-            known = ", ".join(PROCEDURES[arguments.what].slots)
-            raise InputError(f"--with {text}: must be NAME=FILE, with one of {known}")
+            raise InputError(f"--with {text}: must be NAME=FILE, such as held_out=FILE")
         files.setdefault(slot, []).append(Path(file))
-    return find_vehicle(arguments.vehicle or "reference"), [step_of(arguments.what, files, arguments.set)]
+    return requested(arguments.what, files, arguments.set, arguments.vehicle)

@@ -17,9 +17,8 @@ from gz_onboard.recording.recording import Recording, ride_name
 from gz_onboard.recording.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
-Option = float | Mapping[str, float | str]
-"""A number, or by the name of a file the air that moves past the vehicle: a number [m/s] or one of `cooling.AIRFLOWS`.
-"""
+Option = float | str | Mapping[str, float | str]
+"""A number; of ``airflow`` also one of `cooling.AIRFLOWS`, or by the name of a file either of both."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +33,6 @@ class Slot:
     what: str
     least: int = 0
     most: int | None = None
-
-    def check(self, procedure: str, slot: str, count: int) -> None:
-        """InputError for too few or too many files."""
-        if count < self.least:
-            raise InputError(f"{procedure} needs {self.what} ({slot}: {self.least} or more), has {count}")
-        if self.most is not None and count > self.most:
-            raise InputError(f"{procedure} takes {self.most} for {slot} ({self.what}), has {count}")
 
     def is_table(self, file: Path) -> bool:
         """Whether `file` is read as a table, not as a ride."""
@@ -134,20 +126,22 @@ def _cooling(given: Given) -> Result:
 
 def _cooling_runs(given: Given, slot: str) -> list[cooling.CoolingRun]:
     """Those with no airflow stated: tables from a closed room, rides and rollers with air as fast as the wheel."""
-    airflow = given.options["airflow"]
-    assert isinstance(airflow, Mapping)
-    of_log = {ride_name(Path(name)): value for name, value in airflow.items()}
-    return [
-        cooling.bench_run(table, given.vehicle, airflow.get(table.file.name, "none"))
-        for table in given.tables.get(slot, [])
-    ] + [cooling.ride_run(ride, given.vehicle, of_log.get(ride.name, "wheel")) for ride in given.rides.get(slot, [])]
+    airflow, runs = given.options.get("airflow", {}), []
+    by_file = airflow if isinstance(airflow, Mapping) else {}
+    by_ride = {ride_name(Path(name)): value for name, value in by_file.items()}
+    every = None if isinstance(airflow, Mapping) else airflow
+    for table in given.tables.get(slot, []):
+        air = by_file.get(table.file.name, "none") if every is None else every
+        runs.append(cooling.bench_run(table, given.vehicle, air))
+    for ride in given.rides.get(slot, []):
+        air = by_ride.get(ride.name, "wheel") if every is None else every
+        runs.append(cooling.ride_run(ride, given.vehicle, air))
+    return runs
 
 
 def _coastdown(given: Given) -> Result:
-    runs = given.rides.get("data", []) + [coastdown.samples(table) for table in given.tables.get("data", [])]
-    return coastdown.coast_downs(
-        runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd")
-    )
+    wind_sd, slope_sd = given.number("wind_sd"), given.number("slope_sd")
+    return coastdown.coast_downs(given.rides["data"], given.vehicle, wind_sd=wind_sd, slope_sd=slope_sd)
 
 
 _LARGEST: dict[str, Option] = {"largest_current": motor.RIDING_CURRENT}
@@ -214,7 +208,7 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "coastdown": Procedure(
         "rolling resistance and drag area from coast-downs in both directions",
-        {"data": Slot("any", "coast-downs in both directions: rides, or tables of time and speed", 2)},
+        {"data": Slot("ride", "coast-downs in both directions", 2)},
         _coastdown,
         {"wind_sd": coastdown.COASTDOWN.wind_sd, "slope_sd": coastdown.COASTDOWN.slope_sd},
     ),

@@ -25,7 +25,9 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import hypot
 from pathlib import Path
 
@@ -36,7 +38,7 @@ from gz_onboard.calibration.procedures import PROCEDURES, Given, Option
 from gz_onboard.calibration.result import LackingError, Result
 from gz_onboard.calibration.table import Named, read_columns, read_table
 from gz_onboard.calibration.vehicle_file import write_vehicle
-from gz_onboard.errors import InputError, near_file, nearest
+from gz_onboard.errors import InputError, near_file, nearest, shown
 from gz_onboard.model.effect import load_effect
 from gz_onboard.priors import FAR, overrun, stop_at
 from gz_onboard.recording.logs import logs_among
@@ -46,7 +48,7 @@ from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 MANIFEST = "calibration.toml"
 OPTION_RANGE = 1e-6, 1e6
-FASTEST_AIR = 100.0  # m/s
+AIRFLOW, FASTEST_AIR = "airflow", 100.0  # m/s
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,63 @@ class Step:
     options: dict[str, Option] = field(default_factory=dict)
 
 
-# --- from a command line ------------------------------------------------------------------------------------------
+def requested(
+    procedure: str, files: Mapping[str, Sequence[Path]], options: Sequence[str], vehicle: str | Path | None
+) -> tuple[Path, list[Step]]:
+    """(vehicle file to start from, steps) of a `procedure` with its files by slot, or of the manifest for ``all``.
 
-
-def check_procedure(name: str) -> None:
-    """InputError unless `name` is a procedure or ``all``."""
-    if name != "all" and name not in PROCEDURES:
+    options: each as NAME=VALUE. vehicle: to start from, ``reference`` or that of the manifest if None. InputError for
+    an unknown procedure, slot or option, and for missing files.
+    """
+    if procedure == "all":
+        if options or files.keys() - {"data"}:
+            raise InputError("all takes its data and options from the manifest, from nowhere else")
+        return read_manifest(files.get("data", []), vehicle)
+    if procedure not in PROCEDURES:
         known = ["all", *PROCEDURES]
-        raise InputError(f"no procedure is called {name!r}{nearest(name, known)}; there are {', '.join(known)}")
+        raise InputError(
+            f"no procedure is called {procedure!r}{nearest(procedure, known)}; there are {', '.join(known)}"
+        )
+    return find_vehicle(vehicle or "reference"), [step_of(procedure, files, options)]
+
+
+def files_of(steps: Sequence[Step], data: Sequence[Path]) -> list[Path]:
+    """The files that `steps` read, and the manifest in a folder given as `data`."""
+    read = [file for step in steps for files in step.files.values() for file in files]
+    return [*read, *data, *(folder / MANIFEST for folder in data)]
+
+
+def number_options(name: str) -> dict[str, float]:
+    """The options of the procedure `name` that are numbers, with their defaults."""
+    return {option: value for option, value in PROCEDURES[name].options.items() if isinstance(value, float)}
+
+
+def _checked(option: str, value: object, error: Callable[[str], InputError]) -> float | str:
+    """The `value` of an option, a number or one of `AIRFLOWS`. error: makes the error to raise."""
+    if option == AIRFLOW and isinstance(value, str) and value in AIRFLOWS:
+        return value
+    low, high = (0.0, FASTEST_AIR) if option == AIRFLOW else OPTION_RANGE
+    if isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high:
+        return float(value)
+    words = f" or one of {', '.join(AIRFLOWS)}" if option == AIRFLOW else ""
+    raise error(f"must be a number from {low:g} to {high:g}{words}, is {shown(value)}")
+
+
+def _wrong_files(name: str, files: Mapping[str, Sequence[Path]]) -> tuple[str, str] | None:
+    """(slot, why) of files by slot that the procedure `name` cannot take; None if it can."""
+    for slot, needed in PROCEDURES[name].slots.items():
+        count = len(files.get(slot, ()))
+        if count < needed.least:
+            return slot, f"{name} needs {needed.what} ({slot}: {needed.least} or more), has {count}"
+        if needed.most is not None and count > needed.most:
+            return slot, f"{name} takes {needed.most} for {slot} ({needed.what}), has {count}"
+    fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
+    for file in sorted(fitted & held):
+        return "held_out", f"names {file.name}, which is in data too: a file cannot be both fitted and held out"
+    return None
+
+
+# --- from a command line ------------------------------------------------------------------------------------------
 
 
 def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Sequence[str] = ()) -> Step:
@@ -84,10 +135,8 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Sequence[st
             )
         if slots[slot].kind != "table":
             found[slot] = logs_among(group)
-    for slot, needed in slots.items():
-        needed.check(name, slot, len(found.get(slot, ())))
-    if twice := fitted_and_held_out(found):
-        raise InputError(f"--with held_out={twice}: is in the data too; a file cannot be both fitted and held out")
+    if wrong := _wrong_files(name, found):
+        raise InputError(f"--with held_out {wrong[1]}" if wrong[0] == "held_out" else wrong[1])
     for file in (file for group in found.values() for file in group):
         if not file.is_file():
             what = "is a folder; give the files in it" if file.is_dir() else f"no such file{near_file(file)}"
@@ -95,36 +144,16 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Sequence[st
     return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, values)
 
 
-def fitted_and_held_out(files: Mapping[str, Sequence[Path]]) -> str:
-    """Return the name of a file that is in the slots `data` and `held_out`, or an empty text."""
-    fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
-    return min((file.name for file in fitted & held), default="")
-
-
-def number_options(name: str) -> dict[str, float]:
-    """The options of the procedure `name` that are numbers, with their defaults."""
-    return {option: value for option, value in PROCEDURES[name].options.items() if isinstance(value, float)}
-
-
-def _option(text: str, procedure: str) -> tuple[str, float]:
+def _option(text: str, procedure: str) -> tuple[str, Option]:
     name, _, value = text.partition("=")
-    options, (low, high) = number_options(procedure), OPTION_RANGE
+    options = PROCEDURES[procedure].options
     if name not in options:
         known = ", ".join(options) or "none"
         raise InputError(f"--set {text}: no option {name!r}{nearest(name, options)}; there are {known}")
-    try:
+    number: float | str = value
+    with suppress(ValueError):
         number = float(value)
-    except ValueError as error:
-        raise InputError(f"--set {text}: {value!r} is not a number") from error
-    if not low <= number <= high:
-        raise InputError(f"--set {text}: must be {low:g} to {high:g}")
-    return name, number
-
-
-def files_of(steps: Sequence[Step], data: Sequence[Path]) -> list[Path]:
-    """The files that `steps` read, and the manifest in a folder given as `data`."""
-    read = [file for step in steps for files in step.files.values() for file in files]
-    return [*read, *data, *(folder / MANIFEST for folder in data)]
+    return name, _checked(name, number, lambda why: InputError(f"--set {text}: {why}"))
 
 
 # --- from a manifest ----------------------------------------------------------------------------------------------
@@ -158,23 +187,23 @@ def _manifest_step(table: Table, name: str) -> Step:
     slots, defaults = PROCEDURES[name].slots, PROCEDURES[name].options
     table.only([*slots, *defaults, "columns", *(f"{slot}_columns" for slot in slots)])
     files = {slot: _files(table, slot) for slot in slots if slot in table.values}
-    if twice := fitted_and_held_out(files):
-        raise table.error(f"names {twice}, which is in data too: a file cannot be both fitted and held out", "held_out")
-    for slot, needed in slots.items():
-        try:
-            needed.check(name, slot, len(files.get(slot, ())))
-        except InputError as error:
-            raise table.error(str(error), slot if slot in files else "") from error
-    columns, options = {}, {}
+    if wrong := _wrong_files(name, files):
+        slot, why = wrong
+        raise table.error(why, slot if slot in files else "")
+    columns: dict[str, dict[str, Named]] = {}
+    options: dict[str, Option] = {}
     for slot in files:
         own = f"{slot}_columns"
         if named := read_columns(table.table(own if own in table.values else "columns")):
             columns[slot] = named
     for key in (key for key in defaults if key in table.values):
-        if isinstance(defaults[key], Mapping):
-            options[key] = _airflow(table.table(key), [file.name for group in files.values() for file in group])
+        value = table.values[key]
+        if key == AIRFLOW and isinstance(value, Mapping):
+            runs = table.table(key)
+            runs.only([file.name for group in files.values() for file in group])
+            options[key] = {name: _checked(key, air, partial(runs.error, key=name)) for name, air in value.items()}
         else:
-            options[key] = table.number(key, None, *OPTION_RANGE)
+            options[key] = _checked(key, value, partial(table.error, key=key))
     return Step(name, files, columns, options)
 
 
@@ -193,14 +222,6 @@ def _files(table: Table, slot: str) -> tuple[Path, ...]:
         if name in names[:i]:
             raise table.error(f"names {name} twice", slot)
     return tuple(folder / name for name in names)
-
-
-def _airflow(table: Table, files: Sequence[str]) -> Option:
-    table.only(files)
-    return {
-        name: table.text(name, choices=AIRFLOWS) if isinstance(value, str) else table.number(name, None, 0, FASTEST_AIR)
-        for name, value in table.values.items()
-    }
 
 
 # --- running ------------------------------------------------------------------------------------------------------

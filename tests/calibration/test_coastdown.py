@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.coastdown import NAMES, coast, coast_downs, directions, samples
-from gz_onboard.calibration.table import read_table
+from gz_onboard.calibration.coastdown import NAMES, coast, coast_downs, directions
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.recording.recording import Recording, read_recording
@@ -103,10 +102,9 @@ def healthy():
 
 def test_left_out_pairs_are_followed(healthy):
     found = coast_downs(healthy[0], VEHICLE)
-    own, still = (fit for fit in found.fits if fit.held_out)
-    assert own.largest < still.largest < 2.0  # m/s: the thesis' figure
-    assert own.rms < 0.2
-    assert own.points == still.points > 100
+    (fit,) = (fit for fit in found.fits if fit.held_out)
+    assert fit.largest < 2.0  # m/s: the thesis' figure
+    assert fit.points > 100
 
 
 def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
@@ -174,59 +172,6 @@ def test_the_recorded_coastdown():
     assert rolled.temperature == pytest.approx(12.5, abs=0.3)
 
 
-# --- CSV ----------------------------------------------------------------------------------------------------------
-
-
-NOTES = '[{"name": "down", "direction": "down", "total_mass_kg": 180, "ambient_C": 20}]'
-
-
-def in_table(folder, text, notes=NOTES):
-    (folder / "rides.json").write_text(notes)
-    file = folder / "down.csv"
-    file.write_text(text)
-    return samples(read_table(file))
-
-
-def test_a_table_of_time_and_speed(tmp_path):
-    run = in_table(tmp_path, "time_s,speed_kmh\n0,36\n1,35.1\n2.5,34.2\n")
-    time, speed = run.columns["vehicle_speed"]
-    assert time.tolist() == [0, 1, 2.5]
-    assert speed == pytest.approx([10, 9.75, 9.5])
-    assert (run.name, run.facts) == ("down", {"direction": "down", "total_mass_kg": 180, "ambient_C": 20})
-    warm = in_table(
-        tmp_path,
-        "time_s,motor_speed_rpm,ambient_temperature_degC\n0,300,21\n1,295,21\n",
-        '[{"name": "down", "direction": "down", "rider_mass_kg": 70}]',
-    )
-    assert warm.columns["motor_speed"][1][0] == pytest.approx(31.416, abs=1e-3)
-    assert warm.columns["ambient_temperature"][1].tolist() == [21, 21]
-    assert warm.rider_mass == 70
-
-
-@pytest.mark.parametrize(
-    ("text", "notes", "message"),
-    [
-        ("time_s,sped_kmh\n0,1\n1,2\n", NOTES, r"down.csv: no column for 'speed', in m/s \(did you mean 'sped'\?\)"),
-        ("time_s,speed_rpm\n0,1\n1,2\n", NOTES, r"'speed_rpm': speed cannot be in rpm"),
-        ("time_s,speed_mps\n0,1\n1,fast\n2,3\n", NOTES, "line 3, column 'speed_mps': 'fast' is not a finite number"),
-        ("time_s,speed_mps\n0,9\n1,8\n1,7\n", NOTES, "down.csv:4: time: 1 s does not increase"),
-        ("9\n8\n7\n", NOTES, "down.csv:1: 9 ... are numbers, not names of columns"),
-        ("time_s,speed_mps\n0,9\n1,8,7\n", NOTES, "down.csv:3: 3 values for 2 columns"),
-        ("time_s,speed_mps\n0,9\n1,8\n", "[]", "rides.json beside it says no direction of 'down'"),
-        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("tot", "t"), "'tal_mass_kg' is no .*mean 'total_mass_kg'"),
-        (
-            "time_s,speed_mps\n0,9\n1,8\n",
-            NOTES.replace('"ambient_C": 20', '"kind": "x"'),
-            "says no ambient_C of 'down'",
-        ),
-        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("180", '"180 kg"'), "down: total_mass_kg '180 kg': must be"),
-    ],
-)
-def test_what_is_wrong_in_a_table_is_named(tmp_path, text, notes, message):
-    with pytest.raises(InputError, match=message):
-        in_table(tmp_path, text, notes)
-
-
 def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
     """By the command: 1 Hz speeds in CSV, facts beside them."""
     runs, truth = healthy
@@ -236,7 +181,7 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
         rolling = coast(run, VEHICLE, 1)
         inside = (time >= rolling.time[0]) & (time <= rolling.time[-1])
         rows = zip(time[inside], speed[inside] * VEHICLE.parameters["wheel_radius"] * 3.6, strict=True)
-        lines = ["time_s,speed_kmh", *(f"{t:.2f},{v:.4f}" for t, v in rows)]
+        lines = ["time [s],speed [km/h]", *(f"{t:.2f},{v:.4f}" for t, v in rows)]
         (tmp_path / f"{run.name}.csv").write_text("\n".join(lines) + "\n")
         notes.append(
             {

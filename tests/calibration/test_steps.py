@@ -8,7 +8,7 @@ import pytest
 
 from gz_onboard.calibration.result import Found, Result
 from gz_onboard.calibration.sensors import auxiliary_power, cable_resistance, offsets, wheel_radius
-from gz_onboard.calibration.steps import Step, check_against_file, read_manifest
+from gz_onboard.calibration.steps import Step, check_against_file, read_manifest, requested
 from gz_onboard.calibration.table import Named
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import OWN
@@ -54,6 +54,19 @@ def test_steps_come_in_the_order_of_the_procedures(folder):
     assert read(folder, 'vehicle = "scooter.toml"\n' + GOOD)[0] == folder / "scooter.toml"
 
 
+@pytest.mark.parametrize(("said", "meant"), [("none", "none"), ("6", 6.0)])
+def test_one_airflow_for_all_runs_can_be_said_on_the_command_line_too(folder, said, meant):
+    _, (step,) = requested("cooling", {"data": [folder / "b.blf"]}, [f"airflow={said}"], None)
+    assert step.options == {"airflow": meant}
+    quoted = f'"{said}"' if isinstance(meant, str) else said
+    assert read(folder, f'schema = 1\n[cooling]\ndata = "b.blf"\nairflow = {quoted}\n')[1][0].options == step.options
+
+
+def test_all_takes_its_data_from_the_manifest_alone(folder):
+    with pytest.raises(InputError, match="all takes its data and options from the manifest"):
+        requested("all", {"data": [folder], "held_out": [folder / "b.blf"]}, [], None)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
@@ -70,9 +83,9 @@ def test_steps_come_in_the_order_of_the_procedures(folder):
         ('"a.csv"', '["a.csv", "b.blf"]', r"losses.data: losses takes 1 for data \(steady points.*\), has 2"),
         ('"a.csv"', "3", "must be the name of a file, or a list of them"),
         ('data = "a.csv"\n', "", r"calibration.toml:5: losses: losses needs steady points"),
-        ("= 60", '= "x"', r"calibration.toml:8: losses.largest_current: must be a number"),
-        ("= 3 ", '= "fan" ', r"cooling.airflow.c.blf: 'fan' is not one of none, wheel"),
-        ("= 3 ", "= 400 ", r"cooling.airflow.c.blf: 400 is outside 0 to 100"),
+        ("= 60", '= "x"', r"calibration.toml:8: losses.largest_current: must be a number from 1e-06 to 1e"),
+        ("= 3 ", '= "fan" ', r"cooling.airflow.c.blf: must be a number .* or one of none, wheel, is 'fan'"),
+        ("= 3 ", "= 400 ", r"cooling.airflow.c.blf: must be a number from 0 to 100 .* is 400"),
         ('"c.blf" = 3', '"d.blf" = 3', r"calibration.toml:4: cooling.airflow.d.blf: unknown key"),
         ("schema = 1", "schema = 2", "calibration.toml:1: schema: is 2"),
         ("schema = 1", 'schema = 1\nvehicle = "none.toml"', "toml:2: vehicle: .*none.toml: no such vehicle"),
