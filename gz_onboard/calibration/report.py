@@ -7,17 +7,15 @@ import html
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.calibration.fit import correlation
-from gz_onboard.calibration.result import Curve, Fit, Found, Panel, Result
+from gz_onboard.calibration.result import Curve, Fit, Panel, Result
 from gz_onboard.reports.page import html_table, write_page
-from gz_onboard.reports.results import descriptions
 from gz_onboard.reports.style import MUTED, new_figure, rule, write
 
 if TYPE_CHECKING:
@@ -30,55 +28,42 @@ _MOST_OPEN = 8  # panels of a procedure: more are behind a click
 _MOST_TIED = 12  # parameters: a table of more correlations is not read
 
 
-@dataclass(frozen=True)
-class Correlation:
-    """How the errors of parameters are tied: a matrix with ones on its diagonal."""
-
-    parameters: tuple[str, ...]
-    value: Array
-
-
-@dataclass(frozen=True)
-class ProcedureEntry:
-    """What one procedure found, without its pictures."""
-
-    procedure: Annotated[str, "its name"]
-    parameters: Annotated[dict[str, Found], "by name: value, sd, unit, source"]
-    curves: Annotated[dict[str, Curve], "tables of the vehicle file by name: axes, value, sd, unit, source"]
-    correlation: Annotated[list[Correlation], "of parameters found together: parameters, value (a matrix)"]
-    fits: Annotated[list[Fit], "what, unit, rms, largest, r2, points, held_out, data"]
-    refusals: Annotated[list[str], "what the data do not show, and why"]
-    notes: Annotated[list[str], "what else was noticed"]
+KEYS = {
+    "vehicle": "vehicle file that the calibration started from",
+    "out": "vehicle file written, or null",
+    "thesis": "what the thesis gives beside what was found here",
+    "procedures": "one for each procedure:",
+    "  procedure": "its name",
+    "  parameters": "by name: value, sd, unit, source",
+    "  curves": "tables of the vehicle file by name: axes, value, sd, unit, source",
+    "  correlation": "of parameters found together: parameters, value (a matrix)",
+    "  fits": "what, unit, rms, largest, r2, points, held_out, data",
+    "  refusals": "what the data do not show, and why",
+    "  notes": "what else was noticed",
+}
+"""What ``--json`` writes, see `document`."""
 
 
-@dataclass(frozen=True)
-class Document:
-    """What ``--json`` writes."""
-
-    vehicle: Annotated[str, "vehicle file that the calibration started from"]
-    out: Annotated[str | None, "vehicle file written, or null"]
-    procedures: Annotated[list[ProcedureEntry], "one for each procedure:"]
-    thesis: Annotated[list[dict[str, str]], "what the thesis gives beside what was found here"]
-
-
-_OF_ALL = descriptions(Document)
-KEYS = {name: _OF_ALL[name] for name in ("vehicle", "out", "thesis", "procedures")}
-KEYS |= {f"  {key}": text for key, text in descriptions(ProcedureEntry).items()}
-
-
-def document(results: Sequence[Result], vehicle: str, out: str | None) -> Document:
-    """The results as ``--json`` writes them."""
-    entries = [
-        ProcedureEntry(r.procedure, r.parameters, r.curves, _correlations(r), r.fits, r.refusals, r.notes)
-        for r in results
+def document(results: Sequence[Result], vehicle: str, out: str | None) -> dict[str, object]:
+    """The results as ``--json`` writes them, without pictures."""
+    procedures = [
+        {
+            "procedure": result.procedure,
+            "parameters": result.parameters,
+            "curves": result.curves,
+            "correlation": [{"parameters": names, "value": value} for names, value in _correlations(result)],
+            "fits": result.fits,
+            "refusals": result.refusals,
+            "notes": result.notes,
+        }
+        for result in results
     ]
-    return Document(
-        vehicle, out, entries, [dict(zip(THESIS_HEAD, row, strict=True)) for row in compare_thesis(results)]
-    )
+    thesis = [dict(zip(THESIS_HEAD, row, strict=True)) for row in compare_thesis(results)]
+    return {"vehicle": vehicle, "out": out, "procedures": procedures, "thesis": thesis}
 
 
-def _correlations(result: Result) -> list[Correlation]:
-    return [Correlation(names, correlation(np.asarray(matrix))) for names, matrix in result.covariance]
+def _correlations(result: Result) -> list[tuple[tuple[str, ...], Array]]:
+    return [(names, correlation(np.asarray(matrix))) for names, matrix in result.covariance]
 
 
 # --- the thesis' own results --------------------------------------------------------------------------------------
@@ -86,61 +71,38 @@ def _correlations(result: Result) -> list[Correlation]:
 # maps are of efficiency, ours of watts; its meshes are surfaces through values found pulse by pulse.
 
 
-@dataclass(frozen=True)
-class ThesisResult:
+class ThesisResult(NamedTuple):
     """One of the thesis' results: what it reached, and which of our fits answers it.
 
-    fits: (procedure, beginning of `Fit.what`, part of `Fit.data`, held out). measure: "r2" (at least `limit`), or
-    "largest" (at most `limit`, in `unit`).
+    fits: (procedure, beginning of `Fit.what`, part of `Fit.data`, held out). limit: the greatest error in `unit`; of R²
+    where there is no unit, which is to be reached.
     """
 
     what: str
     fits: tuple[str, str, str, bool]
-    measure: str
     limit: float
     unit: str = ""
 
-    @property
-    def thesis(self) -> str:
-        """What the thesis says."""
-        return f"R² {self.limit:.4f}" if self.measure == "r2" else f"±{self.limit:g} {self.unit}"
-
 
 THESIS = (
-    ThesisResult("back-EMF constant", ("motor", "back-EMF", "", True), "r2", 0.9993),
-    ThesisResult("torque constant", ("motor", "shaft torque", "all currents", True), "r2", 0.9804),
-    ThesisResult("inverter map", ("losses", "inverter loss", "all currents", True), "r2", 0.9949),
-    ThesisResult("motor map", ("losses", "motor loss", "all currents", True), "r2", 0.8774),
-    ThesisResult(
-        "R0 over (SOC, T)", ("pulse", "mesh of R0, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9976
-    ),
-    ThesisResult(
-        "R1 over (SOC, T)", ("pulse", "mesh of R1, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9210
-    ),
-    ThesisResult(
-        "C1 over (SOC, T)", ("pulse", "mesh of C1, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9600
-    ),
-    ThesisResult("cell voltage, road profile, 25 °C", ("pulse", "cell voltage", "25C", True), "largest", 0.02, "V"),
-    ThesisResult("cell voltage, road profile, 5 °C", ("pulse", "cell voltage", "_5C", True), "largest", 0.02, "V"),
-    ThesisResult(
-        "motor temperature, calibration", ("cooling", "motor temperature, bench", "", False), "largest", 4, "°C"
-    ),
-    ThesisResult(
-        "motor temperature, validation", ("cooling", "motor temperature, bench", "valid", True), "largest", 10, "°C"
-    ),
-    ThesisResult("motor temperature, riding", ("cooling", "motor temperature, riding", "", True), "largest", 10, "°C"),
-    ThesisResult(
-        "inverter temperature, calibration", ("cooling", "inverter temperature, bench", "", False), "largest", 1, "°C"
-    ),
-    ThesisResult(
-        "inverter temperature, validation", ("cooling", "inverter temperature", "valid", True), "largest", 6, "°C"
-    ),
-    ThesisResult(
-        "inverter temperature, riding", ("cooling", "inverter temperature, riding", "", True), "largest", 6, "°C"
-    ),
-    ThesisResult("cell temperature", ("cooling", "cell temperature", "", True), "largest", 1, "°C"),
-    ThesisResult("BMS temperature", ("cooling", "bms temperature", "", True), "largest", 4, "°C"),
-    ThesisResult("coast-down speed, wind unknown", ("coastdown", "speed, no wind", "", True), "largest", 2, "m/s"),
+    ThesisResult("back-EMF constant", ("motor", "back-EMF", "", True), 0.9993),
+    ThesisResult("torque constant", ("motor", "shaft torque", "all currents", True), 0.9804),
+    ThesisResult("inverter map", ("losses", "inverter loss", "all currents", True), 0.9949),
+    ThesisResult("motor map", ("losses", "motor loss", "all currents", True), 0.8774),
+    ThesisResult("R0 over (SOC, T)", ("pulse", "mesh of R0, SOC 0.2 to 0.9, half against half", "", True), 0.9976),
+    ThesisResult("R1 over (SOC, T)", ("pulse", "mesh of R1, SOC 0.2 to 0.9, half against half", "", True), 0.9210),
+    ThesisResult("C1 over (SOC, T)", ("pulse", "mesh of C1, SOC 0.2 to 0.9, half against half", "", True), 0.9600),
+    ThesisResult("cell voltage, road profile, 25 °C", ("pulse", "cell voltage", "25C", True), 0.02, "V"),
+    ThesisResult("cell voltage, road profile, 5 °C", ("pulse", "cell voltage", "_5C", True), 0.02, "V"),
+    ThesisResult("motor temperature, calibration", ("cooling", "motor temperature, bench", "", False), 4, "°C"),
+    ThesisResult("motor temperature, validation", ("cooling", "motor temperature, bench", "valid", True), 10, "°C"),
+    ThesisResult("motor temperature, riding", ("cooling", "motor temperature, riding", "", True), 10, "°C"),
+    ThesisResult("inverter temperature, calibration", ("cooling", "inverter temperature, bench", "", False), 1, "°C"),
+    ThesisResult("inverter temperature, validation", ("cooling", "inverter temperature", "valid", True), 6, "°C"),
+    ThesisResult("inverter temperature, riding", ("cooling", "inverter temperature, riding", "", True), 6, "°C"),
+    ThesisResult("cell temperature", ("cooling", "cell temperature", "", True), 1, "°C"),
+    ThesisResult("BMS temperature", ("cooling", "bms temperature", "", True), 4, "°C"),
+    ThesisResult("coast-down speed, wind unknown", ("coastdown", "speed, no wind", "", True), 2, "m/s"),
 )
 
 THESIS_HEAD = ("what", "thesis", "ours", "rms", "on", "better")
@@ -149,28 +111,23 @@ THESIS_HEAD = ("what", "thesis", "ours", "rms", "on", "better")
 def compare_thesis(results: Sequence[Result]) -> list[tuple[str, ...]]:
     """Rows of `THESIS_HEAD` for what was calibrated; the worst of several fits that answer one row."""
     rows = []
-    for row in THESIS:
-        procedure, what, data, held_out = row.fits
-        fits = [
-            fit
-            for result in results
-            if result.procedure == procedure
-            for fit in result.fits
-            if fit.what.startswith(what) and data in fit.data and fit.held_out == held_out
-        ]
+    for one in THESIS:
+        procedure, what, data, held_out = one.fits
+        every = [fit for result in results if result.procedure == procedure for fit in result.fits]
+        fits = [f for f in every if f.what.startswith(what) and data in f.data and f.held_out == held_out]
         if fits:
-            rows.append(_thesis_row(row, fits))
+            rows.append(_thesis_row(one, fits))
     return rows
 
 
-def _thesis_row(row: ThesisResult, fits: Sequence[Fit]) -> tuple[str, ...]:
-    on = "; ".join(dict.fromkeys(fit.data for fit in fits)) + ("" if row.fits[3] else " (fitted)")
-    if row.measure == "r2":
-        r2 = min(fit.r2 if fit.r2 is not None else 0.0 for fit in fits)
-        return row.what, row.thesis, f"R² {r2:.4f}", "", on, "yes" if r2 >= row.limit else "no"
-    worst = max(fits, key=lambda fit: fit.largest)
-    ours, rms = (f"{x:.2g} {row.unit}" for x in (worst.largest, max(fit.rms for fit in fits)))
-    return row.what, row.thesis, f"±{ours}", rms, on, "yes" if worst.largest <= row.limit else "no"
+def _thesis_row(one: ThesisResult, fits: Sequence[Fit]) -> tuple[str, ...]:
+    on = "; ".join(dict.fromkeys(fit.data for fit in fits)) + ("" if one.fits[3] else " (fitted)")
+    if not one.unit:
+        r2 = min(fit.r2 or 0.0 for fit in fits)
+        return one.what, f"R² {one.limit:.4f}", f"R² {r2:.4f}", "", on, "yes" if r2 >= one.limit else "no"
+    largest, rms = max(fit.largest for fit in fits), max(fit.rms for fit in fits)
+    better = "yes" if largest <= one.limit else "no"
+    return one.what, f"±{one.limit:g} {one.unit}", f"±{largest:.2g} {one.unit}", f"{rms:.2g} {one.unit}", on, better
 
 
 # --- text ---------------------------------------------------------------------------------------------------------
@@ -232,16 +189,13 @@ def _section(result: Result) -> str:
         rows = [[name, shape(c), c.source] for name, c in result.curves.items()]
         parts.append(html_table(["table", "values", "source"], rows, [0]))
     if result.fits:
-        parts.append(
-            html_table(
-                ["fit", "data", "points", "R²", "rms", "largest", "unit"],
-                [fit_row(f) for f in result.fits],
-                [2, 3, 4, 5],
-            )
-        )
-    for tied in _correlations(result):
-        names = tied.parameters
-        rows = [[a, *(f"{tied.value[i, j]:+.2f}" for j in range(i + 1))] for i, a in enumerate(names)]
+        rows = []
+        for f in result.fits:
+            data, r2 = f"{f.data} ({'held out' if f.held_out else 'fitted'})", "" if f.r2 is None else f"{f.r2:.4f}"
+            rows.append([f.what, data, str(f.points), r2, f"{f.rms:.3g}", f"{f.largest:.3g}", f.unit])
+        parts.append(html_table(["fit", "data", "points", "R²", "rms", "largest", "unit"], rows, [2, 3, 4, 5]))
+    for names, matrix in _correlations(result):
+        rows = [[a, *(f"{matrix[i, j]:+.2f}" for j in range(i + 1))] for i, a in enumerate(names)]
         if len(names) <= _MOST_TIED:
             parts.append(html_table(["correlation", *names], rows, range(1, len(names) + 1)))
     parts += [f'<p class="no">Not identified by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
@@ -251,19 +205,6 @@ def _section(result: Result) -> str:
         summary = f"<summary>Pictures ({len(result.panels)})</summary>"
         parts.append(f'<details{shown}>{summary}<div class="panels">{pictures}</div></details>')
     return "\n".join(parts)
-
-
-def fit_row(fit: Fit) -> list[str]:
-    """A row of the table of fits."""
-    return [
-        fit.what,
-        fit.data + (" (held out)" if fit.held_out else " (fitted)"),
-        str(fit.points),
-        "" if fit.r2 is None else f"{fit.r2:.4f}",
-        f"{fit.rms:.3g}",
-        f"{fit.largest:.3g}",
-        fit.unit,
-    ]
 
 
 def picture(panel: Panel) -> str:
@@ -288,11 +229,11 @@ def _draw(axis: Axes, panel: Panel) -> None:
     rule(axis)
     labels = 0
     for i, trace in enumerate(panel.traces):
-        x, y = thinned(trace.x), thinned(trace.y)
+        every = slice(None, None, max(1, len(trace.x) // _MOST_POINTS))
         points = trace.style in (".", ",", "o", "x", "+")
         axis.plot(
-            x,
-            y,
+            trace.x[every],
+            trace.y[every],
             trace.style,
             color=_COLOURS[i % len(_COLOURS)],
             label=trace.label or None,
@@ -302,8 +243,3 @@ def _draw(axis: Axes, panel: Panel) -> None:
         labels += bool(trace.label)
     if labels:
         axis.legend(fontsize=7.5, frameon=False, ncols=2 if labels > 5 else 1)
-
-
-def thinned(values: Array) -> Array:
-    """`values`, every n-th of them where there are more than a picture shows."""
-    return values[:: max(1, len(values) // _MOST_POINTS)]

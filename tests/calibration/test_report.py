@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.report import VERSION, document, picture, plus_minus, text, thinned, write_report
+from gz_onboard.calibration.report import VERSION, document, picture, plus_minus, text, write_report
 from gz_onboard.calibration.result import Curve, Fit, Found, Panel, PlotLine, Result
 from gz_onboard.reports.results import write_json
 
@@ -96,13 +96,6 @@ def test_text():
 )
 def test_as_many_digits_as_are_known(value, sd, expected):
     assert plus_minus(value, sd) == expected
-
-
-def test_thinning_keeps_the_start():
-    values = np.arange(100_000.0)
-    assert thinned(values)[0] == 0
-    assert 4000 <= len(thinned(values)) < 5000
-    assert np.array_equal(thinned(values[:10]), values[:10])
 
 
 def test_a_picture_of_one_panel():
