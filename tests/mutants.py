@@ -43,7 +43,6 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/model/test_battery.py",
             "tests/estimator/test_parts.py",
             "tests/estimator/test_start_riding.py",
-            "tests/estimator/test_voltages.py",
             GOLDEN,
             "tests/estimator/test_life.py",
         ),
@@ -66,18 +65,12 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "tests/test_state.py",
             "tests/estimator/test_life.py::test_a_snapshot_that_does_not_fit_is_refused",
-            "tests/estimator/test_life.py::test_the_same_events_give_the_same_bits",
             "tests/test_daemon.py",
         ),
     ),
     "forecast": (
         ("estimator/forecast.py", "estimator/consumption.py"),
-        (
-            "tests/estimator/test_forecast.py",
-            "tests/estimator/test_consumption.py",
-            "tests/estimator/test_pace.py",
-            GOLDEN,
-        ),
+        ("tests/estimator/test_forecast.py", "tests/estimator/test_consumption.py", GOLDEN),
     ),
 }
 """By part: the files that are changed, and the tests that have to notice, fastest first."""

@@ -53,11 +53,9 @@ class PackConfig:
     longest_wait_s: float = 60.0  # then the filter starts with whatever there is, knowing nothing
     steady_sd: float = 4.0  # of the movement: how much may be to come
     slow_signals_s: float = 1.5  # wait for signals that come once a second
-    rejected_signals_s: float = 5.0  # wait for signals that come, but cannot be right yet
     possible: float = 0.5  # of the span of the rest voltage: no cell at work is further beyond full or empty
     drop_factor: float = 3.0  # of the drop by the tables: no cell has more, cold and aged ones included
     joined_s: float = 900.0  # how long ago a ride began that is joined under way
-    doubted_start_s: float = 30.0  # a voltage that is doubted so soon has misled the first state
     # Steps
     zero_s: float = 60.0  # a current that reads exactly 0 for longer may be any small one
     near: float = 0.01  # of SOC: over so little the curve is straight
@@ -75,7 +73,7 @@ class PackConfig:
 
 
 PACK = PackConfig()
-FIELDS = {
+FIELDS = {  # of the saved state
     "soc": Number(0.0, 1.0),
     "soc_variance": Number(1e-9, PRIOR.unknown_soc_sd**2),
     "error_variance": Number(1e-12, 1.0),  # V²
@@ -87,11 +85,10 @@ FIELDS = {
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
     "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
 }
-"""Of the saved state."""
 
 
-class RidingModel(Protocol):
-    """Quantities of the vehicle that the state of charge depends on; times in s."""
+class RidingLoad(Protocol):
+    """Quantities of the riding that the state of charge depends on; times in s."""
 
     def power_of_prior(self, now: float) -> float:
         """Power of the prior riding [W]."""
@@ -207,9 +204,7 @@ class BatteryPack:
         self._looked = -inf  # s: when a first voltage was looked at last,
         self._waiting_since = inf  # s: and at first
         self._was_unsteady = False
-        self._started = -inf  # s
-        self._started_from: tuple[FilterState, Past | None, float | None] = self.state, None, None
-        self._joined = self._was_doubted = False
+        self._joined = False
         self._restarted_at = -inf  # s
         self._gap: tuple[float, FilterState, Past] | None = None  # when the pack was measured last, and the state then
         self._voltage_time: float | None = None  # s, of the message whose voltage was used last
@@ -276,17 +271,13 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        riding: RidingModel,
+        load: RidingLoad,
         price: float | None,
     ) -> None:
         """Advance by `dt` [s] to `now` [s].
 
         temperature: of the cells [degC]; speed in m/s; price: the consumption expected [J/m].
         """
-        if reading.voltage_doubted and not self._was_doubted and now - self._started < PACK.doubted_start_s:
-            self.state, past, age = self._started_from  # the voltage has misled the filter
-            self._wait(past, age)
-        self._was_doubted = reading.voltage_doubted
         self._follow_gap(now, dt, reading, temperature, price)
         voltage, current = reading.voltage, reading.current
         if voltage is not None:
@@ -297,7 +288,7 @@ class BatteryPack:
                 self.test.off += 1
         if self.is_started:
             if dt > 0:
-                self._predict(now, dt, reading, temperature, riding)
+                self._predict(now, dt, reading, temperature, load)
             self._follow_vehicle(now, dt, current, speed)
             self._measure(now, dt, reading, temperature)
             if self.weakest.mapped:
@@ -305,7 +296,7 @@ class BatteryPack:
                 self.weakest.step(now, reading, temperature, self.battery, self.soc, overpotential)
         else:
             if voltage is not None:
-                self._await_first(now, voltage, reading, temperature, speed, riding)
+                self._await_first(now, voltage, reading, temperature, speed, load)
             self.vehicle = self.vehicle._replace(current=current)
         self._follow_age()
 
@@ -345,7 +336,7 @@ class BatteryPack:
             way += abs(speed or 0.0) * dt
         self.vehicle = Past(current, way, own_soc.value if own_soc.fresh(now) else own)
 
-    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, riding: RidingModel) -> None:
+    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, load: RidingLoad) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, state, signals = self.battery, self.state, self._signals
         mean = reading.current or 0.0  # over the window
@@ -368,14 +359,14 @@ class BatteryPack:
             reads_zero = reading.source is CurrentSource.PACK and signals.pack_current.value == 0.0
             self._zero_time = self._zero_time + dt if reads_zero and signals.contactor.get(now) != 0 else 0.0
             if self._zero_time > PACK.zero_s:  # many sensors show small currents so
-                load = self._auxiliary_power / (reading.voltage or self.rest_voltage)
-                variance += self._charge_noise.uncounted(load * dt / charge, sqrt(zz))
+                unseen = self._auxiliary_power / (reading.voltage or self.rest_voltage)
+                variance += self._charge_noise.uncounted(unseen * dt / charge, sqrt(zz))
         if self.vehicle.own_soc is not None:
             self.vehicle = self.vehicle._replace(own_soc=self.vehicle.own_soc - flowed)
         v1 = state.v1
         self._advance(dt, mean, variance, temperature)
         self._v1_lag = (v1 - self.state.v1) / 2 if dt <= 2 * WINDOW else 0.0
-        inputs = riding.cell_inputs(now)
+        inputs = load.cell_inputs(now)
         self.effects.step(battery, dt, mean / battery.cells_parallel, self.state.soc, temperature, inputs)
 
     def _advance(self, dt: float, current: float, variance: float, temperature: float) -> None:
@@ -546,7 +537,7 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        riding: RidingModel,
+        load: RidingLoad,
     ) -> None:
         """Start from the first pack `voltage` [V] that holds still, once all that comes once a second is known.
 
@@ -571,28 +562,25 @@ class BatteryPack:
             awaited += [signals.odometer, signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
         least = PACK.slow_signals_s if missing else PACK.steady_s
-        if self.past and signals.has_rejected:
-            least = PACK.rejected_signals_s
         if now - first.time < (PACK.resettled_s if self._was_unsteady else least) and not is_late:
             return
         self._waiting_since, self._was_unsteady = inf, False
         unsteady_sd = self._span if is_late else PACK.steady_sd * moved
-        self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, riding)
+        self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, load)
 
-    def _start(self, now: float, first: First, reading: PackReading, temperature: float, riding: RidingModel) -> None:
+    def _start(self, now: float, first: First, reading: PackReading, temperature: float, load: RidingLoad) -> None:
         """Start from the `first` voltage and the state that was believed."""
         battery, effects, past = self.battery, self.effects, self.past
-        power = riding.power_of_prior(now)
+        power = load.power_of_prior(now)
         if self._unseen:
-            load = first.current
+            drawn = first.current
             if first.moving and not past:
                 before = power / first.voltage / battery.cells_parallel
                 effects.step(battery, PACK.joined_s, before, HALF_FULL, temperature)
             elif not first.moving:
-                load = standing_load(load, first.voltage, self._auxiliary_power)
-            effects.step(battery, self._unseen, load / battery.cells_parallel, HALF_FULL, temperature)
+                drawn = standing_load(drawn, first.voltage, self._auxiliary_power)
+            effects.step(battery, self._unseen, drawn / battery.cells_parallel, HALF_FULL, temperature)
             self._unseen = 0.0
-        self._started, self._started_from = now, (self.state, past, self.past_age)
         self._joined = bool(first.moving) and not past
         first = first._replace(
             temperature=temperature,

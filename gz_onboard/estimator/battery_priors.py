@@ -294,8 +294,11 @@ def first_state(
     slow_sd = hypot(noise.rest, first.voltage_sd, noise.loaded(rough, temperature) if loaded else 0.0)
     once_sd = hypot(noise.resistance * (r0 * current + first.overpotential), first.unsteady_sd)
     if past and age is not None:
-        if not loaded and _is_unused(past, now):
-            v1_sd *= exp(-age / PRIOR.relaxation_s)
+        if not loaded and past.own_soc is not None and now.own_soc is not None:
+            charged = abs(now.own_soc - past.own_soc) > PRIOR.own_soc_sd
+            ridden_since = past.odometer is None or past.odometer != now.odometer
+            if not (charged or ridden_since):
+                v1_sd *= exp(-age / PRIOR.relaxation_s)
         if age < PRIOR.relaxed_s:
             decay = exp(-age / (r1 * c1))
             v1 += (believed.v1 - v1) * decay
@@ -320,14 +323,3 @@ def first_state(
     chord = shown_sd / sd  # SOC per volt
     slopes, seen_variance = (1.0, -chord, 0.0), (chord * once_sd) ** 2 + doubt
     return bounded(condition(state, slopes, shown - soc, seen_variance, least_variance(shown)))
-
-
-def _is_unused(past: Past, now: Past) -> bool:
-    """Whether the vehicle was neither ridden nor charged since `past`, by all that it shows."""
-    return (
-        past.odometer is not None
-        and past.odometer == now.odometer
-        and past.own_soc is not None
-        and now.own_soc is not None
-        and abs(now.own_soc - past.own_soc) <= PRIOR.own_soc_sd
-    )

@@ -21,10 +21,6 @@ FORGOTTEN = 10.0  # s: a current that was not asked for in this time is followed
 CELL_SENSOR_SD_K, CELL_MODEL_SD_K = 1.0, 8.0
 
 
-Supposed = tuple[float, dict[str, float]]
-"""When [s], and the states of the effects then."""
-
-
 class Cell(NamedTuple):
     """The cell model at one state of charge and temperature."""
 
@@ -54,7 +50,7 @@ class CellEffects:
         self.states = {name: 0.0 for name, _, _ in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
         self.mean_overpotential = 0.0  # V of a cell, over the last window
-        self._supposed: dict[str, Supposed] = {}  # by sensor
+        self._supposed: dict[str, tuple[float, dict[str, float]]] = {}  # by sensor: when [s], states of the effects
 
     def step(
         self,

@@ -594,7 +594,7 @@ _HABITS = {name: dict.fromkeys(LearnedQuantity._fields, FINITE) for name in Habi
 _POSITIVE, _ANY = Number(0.0, 1e12), Number(-1e12, 1e12)
 _SIGNED = "measured", "stops", "auxiliary", "modelled", "level", "climb"
 _SUMS = dict.fromkeys(Segment._fields, _POSITIVE) | dict.fromkeys(_SIGNED, _ANY)
-FIELDS = {
+FIELDS = {  # of the saved state
     "unit": dict.fromkeys(("price", "speed"), Number(1e-6, 1e6)),
     "state": {
         "habits": _HABITS,
@@ -609,4 +609,3 @@ FIELDS = {
     "still": Number(0.0, 1e10),  # s
     "time_moving": Number(0.0, 1e7),  # s
 }
-"""Of the saved state."""

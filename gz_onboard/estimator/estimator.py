@@ -55,7 +55,7 @@ _LOSS_VARIANCES = [(int(reason), sd * sd) for reason, sd in LOSS_SD.items()]
 _DEGRADING = ~int(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)
 _NO_PACK = int(NO_PACK)
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
-FIELDS = {
+FIELDS = {  # of the saved state
     "version": Number(VERSION, VERSION),
     "key": Text(10_000),  # compared by `check_vehicle`
     **battery_pack.FIELDS,
@@ -63,7 +63,6 @@ FIELDS = {
     "gyro_bias": Each(Number(-MOTION.max_gyro_bias, MOTION.max_gyro_bias), 2),  # rad/s, of roll and yaw rate
     "riding": forecast.FIELDS,
 }
-"""Of the saved state."""
 
 
 class Estimator:
@@ -224,35 +223,44 @@ class Estimator:
 
     def estimate(self, now: float) -> Estimate:
         """Return the estimate at `now` [s]; cheap, and changes nothing."""
-        motion = self.motion
-        reasons = self._reasons(now)
-        estimate = Estimate(time=now, reasons=Reason(reasons), distrusted=self._distrusted, distance=motion.distance)
+        pack, latest = self.pack, self.forecaster.latest
         silent = self._time is None or now - self._time > max(SILENT_AFTER, self.signals.pause)
-        estimate.activity = self._activity.shown(silent, self.pack.joined)
+        activity, reasons = self._activity.shown(silent, pack.joined), self._reasons(now)
+        values: dict[str, Any] = {"distance": self.motion.distance, "cell_temperature": self._temperatures.cells}
         if not silent:
-            estimate.speed, estimate.acceleration, estimate.grade = motion.speed, motion.acceleration, motion.grade
-            estimate.lean, estimate.yaw_rate, estimate.heading = motion.lean, motion.yaw_rate, motion.heading
-            reading = self._reading
-            estimate.pack_voltage, estimate.pack_current = reading.voltage, reading.current
-            estimate.current_modelled = reading.source is CurrentSource.MODEL
-            estimate.innovation = self.pack.test.innovation
-        estimate.cell_temperature = self._temperatures.cells
-        if not self.pack.is_started:
-            estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
-            return estimate
-        estimate.soc, estimate.soc_sd = self.pack.battery.window.shown(*self.pack.soc)
-        estimate.v1, estimate.innovation_rms = self.pack.state.v1, sqrt(self.pack.test.square)
-        if estimate.soc_sd > UNCERTAIN:
-            estimate.reasons |= Reason.SOC_UNCERTAIN
-        self.forecaster.report(estimate)
-        self.route.report(estimate)
-        estimate.why = self.explainer.latest if self.forecaster.latest else None
-        reasons = int(estimate.reasons)
-        estimate.state = State.DEGRADED if reasons & _DEGRADING else State.VALID
+            values |= self._measured()
+        if not pack.is_started:
+            state = State.INVALID if now > STARTING_FOR else State.STARTING
+            return Estimate(now, state, Reason(reasons), activity, self._distrusted, **values)
+        soc, soc_sd = pack.battery.window.shown(*pack.soc)
+        values |= {"soc": soc, "soc_sd": soc_sd, "v1": pack.state.v1, "innovation_rms": sqrt(pack.test.square)}
+        values |= self.forecaster.report(activity is Activity.CHARGING) | self.route.report()
+        if latest:
+            values["why"] = self.explainer.latest
+            reasons |= Reason.PRIOR_RIDING if latest.mostly_prior else 0
+        if soc_sd > UNCERTAIN:
+            reasons |= Reason.SOC_UNCERTAIN
+        state = State.DEGRADED if reasons & _DEGRADING else State.VALID
         missing = reasons | int(self.signals.lacking)
         if (silent and missing & _NO_PACK == _NO_PACK) or reasons & Reason.SIGNALS_SLOW:
-            estimate.state = State.INVALID
-        return estimate
+            state = State.INVALID
+        return Estimate(now, state, Reason(reasons), activity, self._distrusted, **values)
+
+    def _measured(self) -> dict[str, Any]:
+        """Return the fields of an estimate that are as of the last step."""
+        motion, reading = self.motion, self._reading
+        return {
+            "speed": motion.speed,
+            "acceleration": motion.acceleration,
+            "grade": motion.grade,
+            "lean": motion.lean,
+            "yaw_rate": motion.yaw_rate,
+            "heading": motion.heading,
+            "pack_voltage": reading.voltage,
+            "pack_current": reading.current,
+            "current_modelled": reading.source is CurrentSource.MODEL,
+            "innovation": self.pack.test.innovation,
+        }
 
     def _reasons(self, now: float) -> int:
         s = self.signals

@@ -20,7 +20,7 @@ from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import MOTION
 from gz_onboard.estimator.plausibility.electrical import PackReading
 from gz_onboard.estimator.saved_state import Each, Number
-from gz_onboard.events import Activity, Estimate, Reason
+from gz_onboard.events import Activity
 from gz_onboard.model.battery import HALF_FULL, Battery
 from gz_onboard.model.drawable import Drawable, cells_ahead, drawable, pack_constants
 from gz_onboard.model.model import Model
@@ -60,10 +60,9 @@ class ForecastConfig:
 
 
 FORECAST = ForecastConfig()
-FIELDS = consumption.FIELDS | {
+FIELDS = consumption.FIELDS | {  # of the saved state
     "shown": {"gap": Number(-1e6, 1e6), "forecast": Each(Number(0.0, 1e12), 2, optional=True)}  # m; m, J
 }
-"""Of the saved state: the riding as learned."""
 
 
 def deciles(energy: float, down: float, up: float, variance: float) -> tuple[float, float]:
@@ -378,22 +377,29 @@ class Forecaster:
         flows = -current > MOTION.charging_rate * self.battery.pack_capacity(temperature)
         self._to_full = time_to_full(self.battery, soc, self._charge_current, temperature) if flows else None
 
-    def report(self, estimate: Estimate) -> None:
-        """Write the latest forecast into `estimate`."""
+    def report(self, charging: bool) -> dict[str, Any]:
+        """Return the fields of an estimate that the latest forecast gives; charging: with those of a charge."""
         forecast = self.latest
         if forecast is None:
-            return
-        estimate.range, estimate.range_p10, estimate.range_p90 = forecast.range, forecast.p10, forecast.p90
-        estimate.energy_left, estimate.energy_left_sd = forecast.energy, forecast.energy_sd
-        estimate.consumption_expected = forecast.consumption
-        estimate.consumption_expected_sd = forecast.consumption_sd
-        estimate.consumption_recent = forecast.recent
-        estimate.consumption_factor, estimate.consumption_factor_sd = self._factor
-        if forecast.mostly_prior:
-            estimate.reasons |= Reason.PRIOR_RIDING
-        if estimate.activity is Activity.CHARGING:  # not of a bus that fell silent
-            estimate.charge_power, estimate.time_to_full = self._charge_power, self._to_full
-            estimate.range_full = self.smoother.shown(self._full.range) if self._full else None
+            return {}
+        factor, factor_sd = self._factor
+        of_charge = {
+            "charge_power": self._charge_power,
+            "time_to_full": self._to_full,
+            "range_full": self.smoother.shown(self._full.range) if self._full else None,
+        }
+        return {
+            "range": forecast.range,
+            "range_p10": forecast.p10,
+            "range_p90": forecast.p90,
+            "energy_left": forecast.energy,
+            "energy_left_sd": forecast.energy_sd,
+            "consumption_expected": forecast.consumption,
+            "consumption_expected_sd": forecast.consumption_sd,
+            "consumption_recent": forecast.recent,
+            "consumption_factor": factor,
+            "consumption_factor_sd": factor_sd,
+        } | (of_charge if charging else {})
 
     def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
         """`forecast` with the range to display; to be asked once for each. drawn: see `RangeSmoother.follow`.

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from gz_onboard.estimator.motion import Motion, VibrationMonitor
     from gz_onboard.estimator.signals import Signals
 
-Quantities = dict[str, float]
-"""Inputs of effects by name: see `model.effect.QUANTITIES`."""
+Quantities = dict[str, float]  # inputs of effects by name: see `model.effect.QUANTITIES`
 AHEAD = 1800.0  # s: half of the time that a range lasts
 WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
 # rad: for a wind slower than the vehicle their mean equals that of all headings

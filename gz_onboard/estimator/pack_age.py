@@ -52,7 +52,7 @@ class AgeConfig:
 
 AGE = AgeConfig()
 SAME = 1e-6  # relative: the vehicle file has the same value as when it was learned
-FIELDS = {
+FIELDS = {  # of the saved state
     "of": {"capacity": Number(1e-6), "resistance_factor": Number(1e-6)},  # in the vehicle file
     "inverse_capacity": Number(*PRIOR.inverse_capacity_bounds),
     "capacity_variance": Number(1e-6, AGE.aged_capacity_sd**2),
@@ -60,7 +60,6 @@ FIELDS = {
     "resistance": Number(*PRIOR.resistance_bounds),
     "resistance_variance": Number(1e-6, AGE.aged_resistance_sd**2 + 0.1),
 }
-"""Of the saved state."""
 
 
 @dataclass(frozen=True)

@@ -242,8 +242,8 @@ class PreparedRoute:
         return power
 
 
+# Fields of an estimate about the route: the position on it and the way ahead.
 REPORTED = tuple(f.name for f in fields(Estimate) if f.name.startswith(("route_", "arrival_", "battery_ends_")))
-"""Fields of an estimate about the route: the position on it and the way ahead."""
 
 
 class RouteForecaster:
@@ -315,11 +315,9 @@ class RouteForecaster:
         self._learn(route, costs)
         return self._ahead(route, costs, free, soc, loss_variance)
 
-    def report(self, estimate: Estimate) -> None:
-        """Write the outlook into `estimate`."""
-        if self._route:
-            for name in REPORTED:
-                setattr(estimate, name, getattr(self.outlook, name))
+    def report(self) -> dict[str, Any]:
+        """Return the fields of an estimate about the route; none without one."""
+        return {name: getattr(self.outlook, name) for name in REPORTED} if self._route else {}
 
     def _move(self, now: float, route: PreparedRoute) -> None:
         signals, motion = self._signals, self._motion

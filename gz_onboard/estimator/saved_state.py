@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 
 from gz_onboard.errors import shown
 
-VERSION = 7
-"""Raised with every change of a field; a state of another version is not read."""
+VERSION = 7  # raised with every change of a field; a state of another version is not read
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,7 @@ class Each:
     optional: bool = False
 
 
-Field: TypeAlias = "Number | Text | Each | Mapping[str, Any]"
-"""A mapping stands for an object with exactly these names."""
+Field: TypeAlias = "Number | Text | Each | Mapping[str, Any]"  # a mapping: an object with exactly these names
 
 FINITE = Number()
 

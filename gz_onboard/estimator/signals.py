@@ -34,8 +34,7 @@ STEP_LIMITS = {  # most rise and fall from one message to the next, and more per
     "odometer": (2000.0, 0.0, 70.0),  # m
 }
 FIX_2D, FIX_3D = 2, 3  # of `gps_fix`: a position, an altitude
-POSITION = ("gps_speed", "latitude")
-"""One of which shows that the GPS has a position."""
+POSITION = ("gps_speed", "latitude")  # one of which shows that the GPS has a position
 NEEDED = (
     (Reason.NO_PACK_VOLTAGE, ("pack_voltage",)),
     (Reason.NO_PACK_CURRENT, ("pack_current",)),
@@ -229,11 +228,6 @@ class Signals:
         self.pause = TIMING.pause
         if self.sampled <= TIMING.slowest:
             self.pause = max(TIMING.pause, TIMING.pause_periods * self.sampled)
-
-    @property
-    def has_rejected(self) -> bool:
-        """Whether the last self-reported value of any role was rejected."""
-        return any(signal.accepted and signal.rejected for signal in self.self_reported.values())
 
     def resume(self, values: Mapping[str, float | None]) -> None:
         """Continue from the values that the vehicle reported before, by role."""

@@ -9,15 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.battery_filter import (
-    SCALAR,
-    FilterState,
-    Noise,
-    condition,
-    predict,
-    with_soc,
-    with_wider_capacity,
-)
+from gz_onboard.estimator.battery_filter import SCALAR, FilterState, Noise, condition, predict, with_soc
 from gz_onboard.estimator.filterpy_reference import FILTERPY
 from gz_onboard.pipeline import filter_backend
 
@@ -75,26 +67,12 @@ def test_condition_against_the_textbook():
     assert found.covariance == pytest.approx(((np.eye(4) - k @ h) @ p)[UPPER], rel=1e-9, abs=1e-15)
 
 
-def test_a_capacity_that_is_not_to_be_learned_stays():
-    found = condition(START, (0.8, -1.0, 0.0), 0.1, 1e-5, inf)
-    assert (found.inverse_capacity, found.covariance[7]) == (START.inverse_capacity, START.covariance[7])
-    assert abs(found.covariance[2]) < abs(START.covariance[2])  # and yet SOC owes less to it
-
-
 def test_two_rests_and_the_charge_between_show_the_capacity():
     """40 % of the file's charge out of a pack that holds 0.8: SOC falls by half."""
     state = with_soc(START, 0.9, 0.005**2)._replace(inverse_capacity=1.0)
     state = predict(state, 0.4, 0.0, Noise(4e-7, 4e-5, 0.9))
     state = condition(state, (1.0, 0.0, 0.0), 0.9 - 0.4 / 0.8 - state.soc, 0.006**2, 0.0)
     assert 1 / state.inverse_capacity == pytest.approx(0.8, abs=0.02)
-
-
-def test_a_capacity_made_less_certain_makes_the_count_less_certain():
-    state = predict(with_soc(START, 0.9, 1e-6), 0.3, 0.0, Noise(0.0, 4e-5, 1.0))
-    wider = with_wider_capacity(state, 0.01)
-    before = START._replace(covariance=(*START.covariance[:7], 0.022, 0.0, 0.17))
-    expected = predict(with_soc(before, 0.9, 1e-6), 0.3, 0.0, Noise(0.0, 4e-5, 1.0))
-    assert wider.covariance == pytest.approx(expected.covariance, abs=1e-12)
 
 
 def simulate(seed, seconds=1500, white=2e-3, slope=0.7):

@@ -40,18 +40,6 @@ def test_a_quantity_knows_how_well_it_knows():
     assert abs(np.mean(normalised)) < 0.25
 
 
-def test_a_quantity_learns_how_unlike_rides_are():
-    rng = np.random.default_rng(2)
-    quantity = quantity_of(0.15, 0.05, 0.1)
-    for _ in range(60):
-        level = 0.9 + rng.normal(0, 0.12)
-        for _ in range(24):
-            quantity = quantity.learned(level + rng.normal(0, 0.1) - quantity.now, 250.0)
-        quantity = quantity.next_ride()
-    assert quantity.level == pytest.approx(0.9, abs=0.08)
-    assert np.sqrt(quantity.ride_variance) == pytest.approx(0.12, rel=0.35)
-
-
 @pytest.mark.parametrize(("before", "most"), [(5, 16.0), (20, 16.0), (40, 16.0)])
 def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
     """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -129,11 +128,6 @@ def test_before_riding_nothing_but_the_usual_hills_takes_from_the_rated_range():
     assert why.causes[Cause.CLIMB] == pytest.approx(why.range - why.reference, rel=0.05)
 
 
-def test_half_the_charge_is_half_the_range():
-    why = explained(forecaster(), soc=0.5)
-    assert why.causes[Cause.CHARGE] == pytest.approx(-0.5 * why.reference, rel=0.1)
-
-
 @pytest.mark.parametrize(
     ("riding", "cause", "sign"),
     [
@@ -182,24 +176,6 @@ def test_cells_that_have_aged_are_named():
     assert why.causes[Cause.AGE] == pytest.approx(-0.2 * why.reference, rel=0.2)
 
 
-def test_a_heater_is_told_from_what_nobody_knows():
-    """Both are in the consumption factor; the power of one is measured."""
-    f = forecaster()
-    explainer, heater, x = RangeExplainer(f), 150.0, 0.0
-    for second in range(900):
-        v = 10.0
-        f.learner.auxiliaries.step(1.0, None, heater)
-        f.learner.ride(1.0, v, 0.0, f.load.power(f.load.quantities(v, 0.0, MILD)) + heater, MILD)
-        x += v
-        result = f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0)
-        explainer.take(float(second), result, 0.7, MILD, x)
-    why = explainer.latest
-    assert why is not None
-    check_sum(why)
-    assert why.causes[Cause.AUXILIARIES] < -2000.0
-    assert abs(why.causes[Cause.UNEXPLAINED]) < 0.5 * -why.causes[Cause.AUXILIARIES]
-
-
 # --- over time --------------------------------------------------------------------------------------------------------
 
 
@@ -218,10 +194,3 @@ def test_a_charge_is_one_change_explained_when_it_is_over():
     assert charged.time == 600.0
     for change in explainer.changes:
         check_sum(change)
-
-
-def test_what_was_ridden_survives_a_restart():
-    f = ridden(hills=0.08)
-    again = forecaster()
-    again.restore(json.loads(json.dumps(f.snapshot())))
-    assert explained(again).causes == pytest.approx(explained(f).causes, abs=1.0)

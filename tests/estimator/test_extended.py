@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.load_model import Conditions, Ledger
+from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.model.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.life import CELLS, GROUPS, MOTOR, PACK, Scooter
@@ -44,28 +44,6 @@ def run(vehicle, seconds, change=lambda events: events):
 
 
 # --- the ledger ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("heading", [None, 1.0])
-@pytest.mark.parametrize("vehicle", [BASE, extended("headwind", "tyre_warm_up", wind_north=4.0)], ids=["base", "wind"])
-def test_the_ledger_is_what_the_forecast_models(vehicle, heading):
-    """By effect the same energy, and no forecast moves because it is kept."""
-    results = []
-    for ledger in (None, Ledger()):
-        f = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
-        f.load.ledger = ledger
-        air = AIR._replace(lateral_acceleration=0.0, heading=heading)
-        for second in range(240):
-            f.learner.ride(1.0, 10.0 + 2 * math.sin(second / 5), 0.01, 900.0, air)
-        results.append([f.learner.state, f.learner._segment])
-    assert results[0] == results[1]
-    assert ledger is not None
-    assert ledger.measured == pytest.approx(240 * 900.0)
-    assert sum(ledger.modelled.values()) == pytest.approx(
-        f.learner.state.recent.modelled / f.learner.state.recent.distance * 2400, rel=0.05
-    )
-    assert ledger.modelled.keys() >= {"rolling_resistance", "brakes"}
-    assert ("headwind" in ledger.modelled) == (vehicle is not BASE)
 
 
 # --- effects in the cells -----------------------------------------------------------------------------------------
@@ -125,31 +103,6 @@ def test_the_states_outlive_a_restart_and_relax_meanwhile():
         )
         assert second.pack.effects.states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
         assert second.pack.effects.overpotential == pytest.approx(sum(second.pack.effects.states.values()))
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        ({"version": 1}, "version 1"),
-        ({"cell_effects": {}}, "damaged"),
-        ({"cell_effects": {"slow_relaxation": 3.0}}, "not from -1 to 1"),
-        ({"cell_effects": {"slow_relaxation": float("nan")}}, "is nan"),
-    ],
-)
-def test_a_snapshot_without_good_states_is_refused(damage, message):
-    vehicle = extended("slow_relaxation")
-    e, _ = run(vehicle, 30)
-    with pytest.raises(ValueError, match=message):
-        estimator(vehicle).restore({**e.snapshot(vehicle.key), **damage}, vehicle.key, 1.0)
-
-
-def test_slow_relaxation_leaves_less_to_be_drawn():
-    at = (0.3, 0.01, 0.0, 1.0, 10.0, 0.0)
-    base = Forecaster(BASE.model, BASE.pack, BASE.riding).forecast(*at)
-    vehicle = extended("slow_relaxation", slow_resistance=0.04)
-    slow = Forecaster(vehicle.model, vehicle.pack, vehicle.riding).forecast(*at)
-    assert slow.consumption == base.consumption
-    assert slow.energy < 0.99 * base.energy
 
 
 # --- sensors ------------------------------------------------------------------------------------------------------

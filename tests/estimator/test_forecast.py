@@ -14,7 +14,6 @@ from gz_onboard.constants import DECILE
 from gz_onboard.estimator import forecast as forecast_module
 from gz_onboard.estimator.forecast import Forecaster, deciles
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.saved_state import check
 from gz_onboard.model.cooling import LumpedCooling
 from gz_onboard.model.drawable import cells_ahead, pack_constants
 from gz_onboard.model.effect import load_effect
@@ -101,11 +100,6 @@ def test_uncertainty_of_soc_widens_the_interval():
     assert wide.p90 - wide.p10 > narrow.p90 - narrow.p10
 
 
-def test_cold_takes_range():
-    f = forecaster()
-    assert f.forecast(0.3, 0.01, -10.0, 1.0, 20.0, 0.0).range < 0.9 * f.forecast(0.3, 0.01, 25.0, 1.0, 20.0, 0.0).range
-
-
 def test_empty_is_zero_with_an_upper_bound():
     result = forecast(forecaster(), soc=0.0)
     assert result.range == 0.0
@@ -121,27 +115,6 @@ def test_snapshot_goes_on_as_if_nothing_had_been():
     ride(a, 3, seed=1)
     ride(b, 3, seed=1)
     assert forecast(b).range == pytest.approx(forecast(a).range, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"state": {}},
-        {"state": 3.0},
-        {"shown": {"gap": 1e9, "forecast": None}},
-        {"unit": {"price": 0.0, "speed": 9.0}},
-        {"still": -1.0},
-        {"effects": 7},
-        {"time_moving": float("nan")},
-    ],
-)
-def test_a_damaged_snapshot_is_refused(damage):
-    f = forecaster()
-    ride(f, 4)
-    declared = forecast_module.FIELDS
-    check(declared, json.loads(json.dumps(f.snapshot())))
-    with pytest.raises(ValueError, match="damaged"):
-        check(declared, {**f.snapshot(), **damage})
 
 
 def test_coverage_of_the_interval():
@@ -181,28 +154,6 @@ def test_what_a_liar_taught_is_unlearned():
     f.forget(1000.0)
     assert f.learner.factor == pytest.approx(before, rel=0.02)
     assert forecast(f).consumption == pytest.approx(before * forecast(f).consumption / f.learner.factor, rel=0.02)
-
-
-@pytest.mark.parametrize("watts", [20.0, 60.0, 300.0])
-def test_an_hour_at_standstill_adds_no_price(watts):
-    """With the key on, taken in as riding or not: what was drawn is gone, a kilometre costs what it did."""
-    for teaches in (True, False):
-        f = forecaster()
-        ride(f, 5)
-        before = forecast(f)
-        f.learner.pause()  # what its speed stored is another matter
-        for _ in range(3600):
-            if teaches:
-                f.learner.ride(1.0, 0.0, 0.0, watts, AIR)
-            else:
-                f.learner.pause(1.0)
-        ride(f, 0.5, seed=3)
-        even = forecaster()
-        ride(even, 5)
-        even.learner.pause(3600.0)
-        ride(even, 0.5, seed=3)
-        assert forecast(f).consumption == pytest.approx(forecast(even).consumption, rel=0.025)
-        assert forecast(f).consumption == pytest.approx(before.consumption, rel=0.12)
 
 
 def test_another_ride_begins_with_what_is_usual():

@@ -7,7 +7,6 @@ from math import exp
 
 import pytest
 
-from gz_onboard.estimator.battery_filter import with_soc
 from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
     BATTERY,
@@ -101,17 +100,7 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
     why = e.explainer.latest.causes
     assert why[Cause.AUXILIARIES] < -5000.0
     assert abs(why[Cause.UNEXPLAINED]) < -0.3 * why[Cause.AUXILIARIES]
-    saved = json.loads(json.dumps(e.snapshot("a")))
-    fresh = estimator(SENSED)
-    fresh.restore(saved, "a", 60.0)
-    assert (
-        fresh.forecaster.learner.auxiliaries.mean
-        == e.forecaster.learner.auxiliaries.mean
-        == pytest.approx(355.0, abs=20)
-    )
-    assert fresh.forecaster.learner.consumption_factor == pytest.approx(
-        e.forecaster.learner.consumption_factor, rel=0.05
-    )
+    assert e.forecaster.learner.auxiliaries.mean == pytest.approx(355.0, abs=20)
 
 
 def test_a_plug_that_says_yes_for_ever_does_not_stop_the_learning():
@@ -149,19 +138,6 @@ def test_the_true_state_of_charge_is_within_three_sd_all_the_way(seed):
     assert rows[-1][1].state is State.VALID
 
 
-def test_half_an_hour_of_riding_corrects_a_start_20_percent_off():
-    scooter, e = Scooter(soc=0.7, offset=0.0), estimator()
-    follow(e, scooter.live(2), scooter)
-    e.pack.state = with_soc(e.pack.state, e.pack.state.soc - 0.2, 0.1**2)
-    true, end = follow(e, scooter.live(1800, 9.0), scooter)[-1]
-    assert abs(end.soc - true) < 0.05
-
-
-def test_the_same_events_give_the_same_bits():
-    a, b = (follow(estimator(), scooter.live(120, 9.0), scooter) for scooter in (Scooter(), Scooter()))
-    assert a == b
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -170,8 +146,17 @@ def test_the_same_events_give_the_same_bits():
         ({"soc": 7.0}, "not from 0 to 1"),
         ({"soc_variance": 2e-9}, "impossible"),
         ({"soc_variance": None}, "damaged"),
+        ({"soc_variance": 0.3}, "damaged"),
+        ({"error_variance": float("inf")}, "damaged"),
         ({"riding": {}}, "damaged"),
         ({"soc": float("nan")}, "state.soc is nan"),
+        ({"consumption": -1e300}, "damaged"),
+        ({"odometer": 1e308}, "damaged"),
+        ({"current": 1e200}, "damaged"),
+        ({"own_soc": 1e200}, "damaged"),
+        ({"gyro_bias": [0.0, 0.5]}, "damaged"),
+        ({"v1": float("nan")}, "damaged"),
+        ({"cell_effects": {}}, "damaged"),
     ],
 )
 def test_a_snapshot_that_does_not_fit_is_refused(damage, said):
@@ -301,20 +286,6 @@ def test_a_restart_knows_what_it_does_not_know(make, seconds, speed, charge, tol
     assert end.consumption_expected_sd < without.consumption_expected_sd
 
 
-def test_an_odometer_tells_what_was_ridden():
-    scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, heard(scooter.live(30), own_soc=False), scooter)
-    follow(e, heard(scooter.live(400, 10.0), own_soc=False), scooter)
-    scooter.away(120, 10.0)
-    e, without = restarted(e, 120.0), restarted(e, 120.0)
-    events = list(heard(scooter.live(3, 10.0), own_soc=False))
-    follow(e, events, scooter)
-    follow(without, heard(events, odometer=False), scooter)
-    told, untold = e.estimate(scooter.time), without.estimate(scooter.time)
-    assert told.soc_sd < 0.7 * untold.soc_sd
-    assert abs(told.soc - scooter.soc) < 0.01
-
-
 # --- slow messages --------------------------------------------------------------------------------------------------
 
 
@@ -334,19 +305,6 @@ def test_messages_every_three_seconds_are_integrated_over_three_seconds(declared
     assert worst(rows) < 3
     assert not end.reasons & Reason.SIGNALS_SLOW
     assert end.range is not None
-    knows(e, scooter)
-    knows(other, often)
-    _, end = follow(e, scooter.live(300, 5.0), scooter)[-1]
-    _, usual = follow(other, often.live(300, 5.0), often)[-1]
-    assert end.soc_sd > 1.2 * usual.soc_sd  # what flows between two samples is not known
-
-
-def test_slower_than_the_limit_is_refused_and_said():
-    groups = [Group(g.message, g.roles, None) for g in GROUPS]
-    scooter, e = Scooter(soc=0.8, period=8.0), estimator(groups)
-    rows = follow(e, scooter.live(600, 10.0), scooter)
-    assert rows[-1][1].reasons & Reason.SIGNALS_SLOW
-    assert rows[-1][1].state is State.INVALID
 
 
 def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
@@ -355,6 +313,7 @@ def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
     scooter.period = 8.0
     rows = follow(e, scooter.live(100, 10.0), scooter)
     assert rows[-1][1].reasons & Reason.SIGNALS_SLOW
+    assert rows[-1][1].state is State.INVALID
     scooter.period = 0.1
     rows = follow(e, scooter.live(100, 10.0), scooter)
     assert not rows[-1][1].reasons & Reason.SIGNALS_SLOW
@@ -370,17 +329,6 @@ def test_an_age_that_is_none_is_not_known(age):
     rows = follow(e, events, scooter)
     assert worst(rows) < 3
     assert rows == follow(unknown, events, scooter)
-
-
-def test_a_sensor_that_twitches_at_standstill_is_no_motion():
-    scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, scooter.live(20), scooter)
-    follow(e, scooter.live(540, 10.0), scooter)
-    follow(e, scooter.live(130), scooter)
-    duration = e.forecaster.learner._segment.duration
-    twitching = ((t, g, (4.0,) if g == MOTOR and t % 60 < 0.1 else v) for t, g, v in scooter.live(1200))
-    follow(e, twitching, scooter)
-    assert e.forecaster.learner._segment.duration == duration
 
 
 @pytest.mark.parametrize("shown", [1.0, 3.0], ids=["plugged in", "not available"])

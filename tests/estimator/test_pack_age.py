@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gz_onboard.estimator.battery_filter import SCALAR, FilterState, Noise, condition, predict, with_soc
 from gz_onboard.estimator.battery_priors import bounded
-from gz_onboard.estimator.pack_age import AGE, FIELDS, Belief, PackAge, believe, mixture_variance
+from gz_onboard.estimator.pack_age import AGE, Belief, PackAge, believe, mixture_variance
 from gz_onboard.estimator.plausibility.electrical import CurrentSource, PackReading
-from gz_onboard.estimator.saved_state import check
 from gz_onboard.model.battery import Battery, Health
 from gz_onboard.model.series import advanced
 from gz_onboard.vehicle import read_vehicle
@@ -104,12 +100,6 @@ def test_half_a_discharge_shows_capacity_and_resistance(capacity: float, resista
     assert 0.5 < found["capacity"].share < 1
 
 
-def test_a_healthy_pack_is_held_for_one():
-    aged, soc = discharge(1.0, 1.0, 0.7)
-    assert aged.age.learned(aged.state)["capacity"].value == pytest.approx(1.0, abs=0.01)
-    assert aged.age.published(aged.state)[0] == pytest.approx(soc, abs=0.005)
-
-
 @pytest.mark.parametrize(
     "reading",
     [
@@ -164,23 +154,6 @@ def test_a_state_of_another_capacity_is_as_new():
     assert other.learned(state)["resistance"].value == aged.age.learned(aged.state)["resistance"].value
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"inverse_capacity": 9.0}, {"inverse_capacity": math.nan}, {"capacity_variance": "x"}]
-)
-def test_an_impossible_age_is_refused(wrong: dict[str, Any]):
-    aged = Aged.new()
-    with pytest.raises(ValueError, match="is damaged"):
-        check(FIELDS, aged.age.snapshot(aged.state) | wrong)
-
-
-def test_it_stays_within_bounds_whatever_comes():
-    for capacity, resistance in ((0.3, 6.0), (1.6, 0.2)):
-        aged, _ = discharge(capacity, resistance, 0.4)
-        learned = aged.age.learned(aged.state)
-        assert 0.5 - 1e-9 <= learned["capacity"].value <= 1 / 0.9 + 1e-9
-        assert 0.5 <= learned["resistance"].value <= 4.0
-
-
 # --- the belief, against the same by brute force on a grid ------------------------------------------------------------
 
 AS_NEW, NEW_SD = 0.5, 0.01
@@ -226,12 +199,3 @@ def test_the_belief_follows_from_bayes_theorem(seen, resistance):
     assert found.inverse - 1 == pytest.approx(mean, abs=0.001)
     assert found.variance == pytest.approx(expected, rel=0.01, abs=1e-6)
     assert (found.low - 1, found.high - 1) == pytest.approx((low, high), abs=0.0015)
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.floats(0.5, 2.5), st.floats(1e-6, 1.0), st.floats(-0.5, 0.5), st.floats(0.5, 4.0), st.floats(0.01, 1e3))
-def test_whatever_is_seen_the_belief_is_a_number(inverse, share, with_soc, factor, sd):
-    found = belief(inverse, share * PRIOR_VARIANCE, with_soc, factor, sd)
-    assert np.isfinite(found).all()
-    assert found.variance > 0
-    assert found.low <= found.high

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from gz_onboard.estimator.battery_pack import PACK, InnovationTest
-from gz_onboard.estimator.battery_priors import PRIOR, ChargeNoise, VoltageNoise
+from gz_onboard.estimator.battery_priors import PRIOR, VoltageNoise
 from gz_onboard.estimator.plausibility.electrical import CurrentSource
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES, Reason
@@ -17,7 +17,6 @@ from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
 
 VEHICLE = read_vehicle("reference")
-BATTERY = VEHICLE.pack
 SLOW = 1e-4  # V²
 LOAD = 0.005**2  # V²
 RESTARTED = 0.35**2  # V²
@@ -57,18 +56,6 @@ def test_a_model_that_is_blamed_is_believed_again_only_once_it_follows():
     assert blamed[-1] == pytest.approx(0.3**2, rel=0.1)
     followed = [gate.noise(1.0, 0.01, uncertain, SLOW, LOAD, RESTARTED) for _ in range(7200)]
     assert followed[-1] == pytest.approx(LOAD)
-
-
-def test_errors_of_currents_go_with_the_size_of_the_pack():
-    """No sensor at all: two packs of one cell, one ten times the other, lose their state of charge alike."""
-    variances = []
-    for parallel in (BATTERY.cells_parallel, 10 * BATTERY.cells_parallel):
-        battery = replace(BATTERY, cells_parallel=parallel)
-        charge = 3600 * battery.pack_capacity(25.0)
-        uncertainty = ChargeNoise(battery, VEHICLE.parameters)
-        variances.append(uncertainty.counted(60.0, 0.0, charge, CurrentSource.NONE, 0.0))
-    assert variances[1] == pytest.approx(variances[0], rel=1e-4)
-    assert variances[0] ** 0.5 == pytest.approx(0.46 / 60 * 2**0.5, rel=1e-3)
 
 
 def test_a_signal_that_is_left_out_or_stale_is_a_reason():

@@ -92,11 +92,6 @@ def test_no_sensor_is_faulty_that_errs_by_a_few_percent_or_is_late(roles: tuple[
     assert faulty(speeds.sensors) == set()
 
 
-def test_contradicted_it_is_not_believed_from_the_first_step():
-    _, signals = ridden(20.0, FOUR, {"motor_speed": lambda t, v: v if t < 19.85 else 2 * v})
-    assert not signals.motor_speed.trusted
-
-
 @pytest.mark.parametrize("role", ["motor_speed", "wheel_speed_rear", "wheel_speed_front"])
 def test_slip_and_a_locked_wheel_for_two_seconds_are_no_faults(role: str):
     faults: tuple[Fault, Fault] = (lambda t, v: 0.0 if t % 30 < 2 else v), (lambda t, v: 2 * v if t % 30 < 2 else v)
@@ -150,12 +145,6 @@ def test_a_gps_without_a_fix_does_not_count():
         signals.show(t, {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0})
         speeds.step(t, STEP, gap=False)
     assert faulty(speeds.sensors) == set()
-
-
-def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
-    before = ridden(20.0, FOUR, {"wheel_speed_front": lambda t, v: 0.0 if t > 19 else v})
-    _, signals = ridden(20.0, ("wheel_speed_front",), {}, before=before, begin=20.0)
-    assert signals.wheel_speed_front.trusted
 
 
 # --- currents -----------------------------------------------------------------------------------------------------
@@ -383,70 +372,3 @@ def test_a_single_witness_of_the_grade_is_held_against_the_energy():
     for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
         role, fault = GRADE_FAULTS[name]
         assert hills(800.0, {role: fault}, (role,)).faulty == {role}
-
-
-def brisk(t: float) -> float:
-    """The true speed [m/s]: stops and goes, with 1.5 m/s²."""
-    return max(0.0, 7.0 + 6.0 * sin(t / 4.0))
-
-
-def every(steps: int, late: float = 0.0, gaps: float = 0.0) -> Fault:
-    """A sensor that reports every so many steps, late [s], and not in the first `gaps` [s] of each half minute."""
-    scale = lambda t, v: v / brisk(t) if brisk(t) else 0.0  # noqa: E731
-    return lambda t, v: None if round(t / STEP) % steps or t % 30 < gaps else scale(t, v) * brisk(t - late)
-
-
-def beside_speeds(speeds_as: Mapping[str, Fault], accelerometer: Fault = lambda t, v: v) -> Grades:
-    """Two minutes of an accelerometer beside speeds that report as their faults make them; nothing else decides."""
-    grades: list[Grades] = []
-
-    def compare(t: float, signals: ShownSignals, speeds: SpeedCheck) -> None:
-        value = accelerometer(t, (brisk(t) - brisk(t - STEP)) / STEP + 0.1 * sin(77 * t))
-        assert value is not None
-        signals.accel_x.reported, signals.accel_x.time = value, t
-        if not grades:
-            grades.append(Grades(signals, speeds))
-        grades[0].step(t, STEP, None)
-
-    ridden(120.0, tuple(speeds_as), speeds_as, brisk, each=compare)
-    return grades[0]
-
-
-GPS: dict[str, Fault] = {
-    "10 Hz": every(1),
-    "5 Hz": every(2),
-    "2 Hz": every(5),
-    "1 Hz": every(10),
-    "1 Hz, 0.5 s late": every(10, late=0.5),
-    "1 Hz, gaps of 5 s": every(10, gaps=5.0),
-    "5 Hz, 0.5 s late": every(2, late=0.5),
-    "5 Hz, gaps of 5 s": every(2, gaps=5.0),
-}
-
-
-ACCELEROMETERS: dict[str, Fault] = {
-    name: GRADE_FAULTS[name][1] for name in ("doubled", "turned round", "stuck", "full scale")
-} | {"halved": lambda t, v: v / 2, "zero but for its tremor": lambda t, v: 0.1 * sin(77 * t)}
-
-
-@pytest.mark.parametrize("name", ACCELEROMETERS)
-@pytest.mark.parametrize("gps", GPS)
-def test_a_wrong_accelerometer_is_found_beside_a_gps_speed_however_seldom(gps: str, name: str):
-    speeds = {"motor_speed": every(1), "gps_speed": GPS[gps]}
-    assert beside_speeds(speeds, ACCELEROMETERS[name]).faulty == {"accel_x"}
-
-
-def test_pulling_away_on_a_slope_is_no_fault():
-    """What the slope shows is no part of the wheels' acceleration."""
-    grades = grade_check()
-    signals, speeds = grades.signals, grades.speeds
-    for grade in (-0.06, 0.06):
-        speed = 0.0
-        for step in range(500):
-            t = step * STEP
-            acceleration = 1.0 if step > 300 and speed < 12 else 0.0
-            speed += acceleration * STEP
-            signals.show(t, {"accel_x": acceleration + GRAVITY * grade + 0.1 * sin(77 * t)})
-            speeds.median, signals.motor_speed.time = speed, t
-            grades.step(t, STEP, speed)
-            assert not grades.faulty

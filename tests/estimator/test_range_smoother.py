@@ -32,16 +32,6 @@ def test_a_forecast_that_holds_is_shown_as_it_is():
     assert shown(raw, ridden) == pytest.approx(raw, abs=1e-6)
 
 
-def test_noise_of_the_forecast_hardly_shows():
-    """Errors of 3 % that stay alike over a kilometre: of them less than a third of a km remains per km."""
-    rng = np.random.default_rng(0)
-    ridden = np.full(3000, 10.0)
-    error = np.interp(np.arange(3000), np.arange(0, 3001, 100), rng.normal(0, 0.03, 31))
-    left = 50_000 - np.cumsum(ridden)
-    total = (shown(left * (1 + error), ridden) + np.cumsum(ridden))[::100]
-    assert np.percentile(np.abs(np.diff(total)), 90) < 300
-
-
 def test_a_real_change_is_followed_within_three_lengths():
     ridden = np.full(4000, 10.0)
     at = np.cumsum(ridden)

@@ -6,10 +6,8 @@ import json
 
 import pytest
 
-from gz_onboard.estimator import forecast
 from gz_onboard.estimator.consumption import CONSUMPTION, Segment
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.saved_state import check
 from gz_onboard.events import Group
 from tests.estimator.life import BATTERY, VEHICLE, estimator
 
@@ -61,25 +59,6 @@ def test_riders_do_not_fill_the_state():
         f.ridden_by(str(number))
     assert len(f.learner.other_riders) <= CONSUMPTION.most_riders
     forecaster().restore(json.loads(json.dumps(f.snapshot())))
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"rider": 3},
-        {"rider": "x" * (CONSUMPTION.most_name_letters + 1)},
-        {"riders": {"anna": {}}},
-        {"riders": {"ben": 1}},
-        {"riders": 7},
-    ],
-)
-def test_damaged_riders_are_refused(damage):
-    f = forecaster()
-    f.ridden_by("anna")
-    saved = json.loads(json.dumps(f.snapshot()))
-    check(forecast.FIELDS, saved)
-    with pytest.raises(ValueError, match="damaged"):
-        check(forecast.FIELDS, {**saved, **damage})
 
 
 def test_a_signal_names_the_rider_while_the_vehicle_stands():

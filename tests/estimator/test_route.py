@@ -14,7 +14,7 @@ from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
 from gz_onboard.estimator.route import PreparedRoute, RouteForecaster
-from gz_onboard.events import Cause, Estimate, Explanation, RouteState
+from gz_onboard.events import Cause, Explanation, RouteState
 from gz_onboard.model.drawable import Drawable
 from gz_onboard.routes.route import Route
 from tests.events import ShownSignals
@@ -81,21 +81,7 @@ def test_without_a_route_nothing_changes():
     rider = Rider()
     assert rider.ask() is FREE
     assert rider.forecast.outlook.route_state == RouteState.NONE
-    estimate = Estimate(0.0)
-    rider.forecast.report(estimate)
-    assert estimate == Estimate(0.0)
-
-
-def test_arrival_and_range_on_a_short_route():
-    found, answer = Rider(way(5e3)).settled()
-    assert answer.route_state == RouteState.ON
-    assert answer.route_left == pytest.approx(5e3)
-    assert answer.battery_ends_after is answer.battery_ends_latitude is None
-    assert 5e3 * 60 < answer.route_energy < 5e3 * 130
-    assert found.range == pytest.approx(5e3 + (FREE.energy - answer.route_energy) / FREE.consumption)
-    assert found.p10 < found.range < found.p90
-    assert 0.7 - answer.arrival_soc == pytest.approx(0.7 * answer.route_energy / FREE.energy, rel=0.15)
-    assert answer.arrival_soc_p10 < answer.arrival_soc < answer.arrival_soc_p90 < 0.7
+    assert rider.forecast.report() == {}
 
 
 def test_a_route_shows_at_once_and_so_does_its_end():
@@ -167,17 +153,6 @@ def test_the_cost_is_learned():
     assert rider.forecast.cost == pytest.approx(1.4, abs=0.1)
 
 
-def test_on_a_route_the_forecast_is_known_from_what_was_ridden_of_it():
-    rider = Rider(way(60e3))
-    early = rider.settled()[0].known_from
-    costs = rider.forecast.costs
-    assert costs
-    rider.ride(700, costs.level[-1] / 60e3 * 11.0)
-    later = rider.ask().known_from
-    assert early < 1500 < 5000 < later
-    assert Rider(way(1e3)).settled()[0].known_from == pytest.approx(FREE.known_from, rel=0.05)
-
-
 def test_off_the_route_it_is_as_without_one_and_comes_back():
     rider = Rider(way(5e3))
     rider.signals = rider.forecast._signals = ShownSignals("latitude", "longitude")
@@ -198,28 +173,6 @@ def test_off_the_route_it_is_as_without_one_and_comes_back():
     assert rider.forecast.outlook.route_energy is None
     assert [at(0.0, 700 + 10.0 * k) is FREE for k in range(20)][-1] is False
     assert rider.forecast.outlook.route_along == pytest.approx(890, abs=5)
-
-
-def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
-    rider = Rider(way(5e3))
-    answers = []
-    for k in range(600):  # its end is reached after 5 km
-        rider.ride(1, 1000.0)
-        rider.forecaster.learner.distance += 11.0
-        free = FREE._replace(range=2 * FREE.range)
-        found = rider.ask(free if k > 300 else FREE)
-        answers.append((rider.forecast.outlook.route_state, found.range, rider.forecaster.shown(found).range))
-    left = next(k for k, (state, *_) in enumerate(answers) if k > 300 and state == RouteState.OFF)
-    (_, raw, shown), (_, raw_before, _) = answers[left], answers[left - 1]
-    assert raw - raw_before > 1000
-    assert shown == pytest.approx(raw)
-
-
-def test_its_end_is_the_end_of_it():
-    rider = Rider(way(1e3))
-    rider.ride(120, 1000.0)
-    assert rider.forecast.outlook.route_state == RouteState.OFF
-    assert rider.ask() is FREE
 
 
 def test_an_empty_battery_has_no_range():

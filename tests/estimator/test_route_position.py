@@ -87,16 +87,6 @@ def test_out_and_back_does_not_jump():
         assert along == pytest.approx(STEP * i, abs=25)
 
 
-def test_turning_back_early_on_it_goes_on_homeward():
-    position = RoutePosition(route([(0, 0), (0, 3000), (1, 0)]))
-    seen = ride(position, [(0, 0), (0, 1000), (1, 0)])
-    assert seen[99] == pytest.approx(1000, abs=10)
-    homeward = [along for along in seen[101:-1] if along is not None]
-    assert homeward[-1] == pytest.approx(6000 - 10, abs=30)
-    first = seen.index(homeward[0], 101)
-    assert STEP * (first - 100) <= CONFIG.leaving + CONFIG.staying_far + 60
-
-
 def test_a_loop_ridden_twice_goes_on_counting():
     lap = [(0, 0), (0, 500), (500, 500), (500, 0), (0, 0)]
     corners = [*lap, *lap[1:]]

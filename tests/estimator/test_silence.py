@@ -7,7 +7,7 @@ from math import exp
 import pytest
 
 from gz_onboard.estimator.plausibility.residual import CONFIG, LimitCheck
-from gz_onboard.events import Activity, Group, Reason, State
+from gz_onboard.events import Group, Reason, State
 from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, follow, set_soc, worst
 from tests.events import ShownSignals
 
@@ -111,55 +111,6 @@ def test_a_late_voltage_is_used_however_seldom_it_comes(period, latency):
     assert worst(rows) < 3
 
 
-def test_a_gps_without_a_fix_tells_no_speed():
-    groups = [GROUPS[PACK], Group("GPS", ("gps_speed", "gps_course", "gps_fix"), 1.0), GROUPS[CELLS]]
-    scooter, e = Scooter(soc=0.8), estimator(groups)
-
-    def with_fix(events, fix):
-        for event in events:
-            if event[1] == PACK:
-                yield event
-            elif event[1] == CELLS:
-                yield event[0], 2, event[2]
-                yield event[0] + 0.005, 1, (scooter.speed if fix > 1 else 0.0, 0.0, fix)
-
-    follow(e, with_fix(scooter.live(60, 10.0), 3.0), scooter)
-    assert e.estimate(scooter.time).speed == pytest.approx(scooter.speed, abs=1.5)
-    follow(e, with_fix(scooter.live(60, 10.0), 0.0), scooter)
-    lost = e.estimate(scooter.time)
-    assert lost.speed is None
-    assert lost.activity is Activity.UNKNOWN
-    assert lost.reasons & Reason.NO_SPEED
-    assert lost.reasons & Reason.NO_GPS
-    follow(e, with_fix(scooter.live(60, 10.0), 3.0), scooter)
-    assert e.estimate(scooter.time).speed == pytest.approx(scooter.speed, abs=1.5)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"consumption": 1e300},
-        {"consumption": -1e300},
-        {"odometer": 1e308},
-        {"current": 1e200},
-        {"own_soc": 1e200},
-        {"gyro_bias": [0.0, 0.5]},
-        {"soc": -0.04},
-        {"soc": 1.04},
-        {"soc_variance": -0.01},
-        {"soc_variance": 0.3},
-        {"error_variance": float("inf")},
-        {"v1": float("nan")},
-    ],
-    ids=str,
-)
-def test_a_saved_number_that_cannot_be_is_refused(damage):
-    scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, scooter.live(60, 10.0), scooter)
-    with pytest.raises(ValueError, match="is damaged"):
-        estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
-
-
 @pytest.mark.parametrize(("seconds", "charge"), [(3600, 15.0), (7200, 8.0), (600, 15.0), (3600, 0.0)])
 @pytest.mark.parametrize("soc", [0.15, 0.3])
 def test_charged_or_parked_while_the_bus_was_silent(soc, seconds, charge):
@@ -226,12 +177,3 @@ def test_a_precharge_accuses_nobody(begin, time_constant):
     rows = follow(e, precharged(scooter.live(15)), scooter) + follow(e, scooter.live(100, 10.0), scooter)
     assert {role for _, row in rows for role in row.distrusted} == set()
     assert worst(rows) < 3
-
-
-@pytest.mark.parametrize("volts", [-2.0, 2.0])
-def test_a_start_on_a_voltage_that_lies_is_made_again(volts):
-    scooter, e = Scooter(soc=0.6), estimator()
-    spoilt = ((t, g, (v[0] + volts, *v[1:]) if g == PACK else v) for t, g, v in scooter.live(300, 10.0))
-    rows = follow(e, spoilt, scooter)
-    assert worst(rows[20:]) < 3
-    assert "pack_voltage" in rows[-1][1].distrusted

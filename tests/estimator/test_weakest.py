@@ -6,27 +6,23 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
-from gz_onboard.can.codec import Codec
 from gz_onboard.estimator import forecast
-from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.weakest import CONFIG, NAMES
-from gz_onboard.events import Cause, Group
+from gz_onboard.events import Group
 from gz_onboard.model.battery import Battery, Health, WeakGroup
 from gz_onboard.model.drawable import drawable
 from gz_onboard.vehicle import read_vehicle
-from tests.events import Event, EventEstimator, events_of
+from tests.events import Event, EventEstimator
 from tests.plant.machine import SERIES
 from tests.plant.packs import STEP, Discharge, discharge
 from tests.plant.ride import Hidden
 from tests.plant.sensors import GROUP_NOISE, GROUPS
-from tests.support import EPOCH, identifier, with_cell_voltages
 
 Lie = Callable[[float, float], float | None]
 """Another value of time [s] and lowest voltage [V]."""
@@ -118,15 +114,6 @@ def drawn(kind: Hidden, since: float) -> float:
 # --- the signal -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("raw", "value", "faults"), [(3612, 3.612, 0), (0xFFFF, None, 1), (5600, None, 1)])
-def test_a_voltage_that_no_cell_has_is_dropped_and_counted(tmp_path: Path, raw: int, value: float | None, faults: int):
-    codec = Codec(with_cell_voltages(tmp_path).mapping)
-    frame = EPOCH, identifier("BMS_Cells"), raw.to_bytes(2, "little") + bytes(6), 0
-    ((_, group, values),) = events_of(codec, [frame])
-    assert values[codec.groups[group].roles.index("lowest_cell_voltage")] == value
-    assert sum(codec.faults.values()) == faults
-
-
 # --- learned and used -----------------------------------------------------------------------------------------------
 
 
@@ -150,26 +137,6 @@ def test_a_healthy_pack_has_none():
         for x in found.pack.weakest.learned().values():
             assert abs(x.value - 1) < 2 * x.sd
         assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
-
-
-def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
-    found = at(WEAK, 0.2)
-    explainer, believed, ends = found.explainer, found.pack.battery, []
-    for known in (believed.health, replace(believed.health, weakest=None)):
-        found.pack.battery = believed.aged(known)
-        soc, sd = found.pack.soc
-        forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
-        ends.append(explainer.state(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0))
-    found.pack.battery = believed
-    with_it, without = (explainer.explain(explainer.rated, end) for end in ends)
-    for why in (with_it, without):
-        assert sum(why.causes.values()) == pytest.approx(why.range - why.reference, abs=1e-6)
-    shorter = ends[1].range - ends[0].range
-    assert shorter > 1000
-    for cause in Cause:
-        if cause:
-            more = with_it.causes[cause] - without.causes[cause]
-            assert abs(more + (shorter if cause is Cause.AGE else 0.0)) < 0.25 * shorter, cause
 
 
 # --- signals that lie -----------------------------------------------------------------------------------------------
@@ -197,16 +164,6 @@ def test_a_lie_from_the_start_teaches_nothing(name: str):
     assert left(found, found.pack.battery.health.weakest) == pytest.approx(left(found, None), rel=0.005)
 
 
-def test_a_group_that_would_long_be_empty_is_none():
-    """A signal 0.15 V too low from the start looks like a weak group, until the pack goes on without it."""
-    deceived, later = (ridden(Hidden(), until, lambda t, v: v - 0.15) for until in (0.3, 0.12))
-    assert not deceived.pack.weakest.refused
-    assert left(deceived, deceived.pack.weakest.group) < 0.5 * left(deceived, None)
-    assert later.pack.weakest.refused
-    assert later.pack.weakest.group is None
-    assert left(later, later.pack.battery.health.weakest) == pytest.approx(left(later, None))
-
-
 # --- kept -----------------------------------------------------------------------------------------------------------
 
 
@@ -218,15 +175,6 @@ def test_what_was_learned_survives_a_restart():
     assert again.pack.weakest.learned() == before.pack.weakest.learned()
     assert again.pack.battery.health.weakest == before.pack.battery.health.weakest
     assert again.pack.weakest.known == before.pack.weakest.known
-
-
-def test_a_state_of_another_pack_has_none():
-    again: Any = EventEstimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
-    saved = at(WEAK, 0.2).snapshot("key")
-    saved["learned"]["weakest"]["of"] *= 1.1
-    again.restore(saved, "key", 10.0)
-    assert again.pack.weakest.known.blocks == 0
-    assert again.pack.battery.health.weakest is None
 
 
 @pytest.mark.parametrize(

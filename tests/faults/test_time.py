@@ -22,13 +22,6 @@ from tests.faults.support import (
 from tests.support import Run, S, check_frames, check_sound, reasons_in, received, ridden
 
 
-def restamped(index: int, offset_s: float) -> list[Frame]:
-    """The ride with one frame stamped wrongly."""
-    frames = list(ride())
-    frames[index] = (frames[index][0] + round(offset_s * S), *frames[index][1:])
-    return frames
-
-
 @pytest.mark.parametrize("step", [-86400.0, -3600.0, -30.0, -1.0])
 def test_the_clock_is_set_back(step: float):
     first = ride()[0][0]

@@ -78,32 +78,6 @@ def test_the_portions_in_which_frames_arrive_do_not_matter():
 # --- the tools themselves -----------------------------------------------------------------------------------------
 
 
-def row(**values):
-    return {"time": "1", "soc": "0.5", "state": "VALID", "range": "1000", **values}
-
-
-def test_a_difference_is_told_with_its_field_and_size():
-    before, now = [row(), row(), row()], [row(), row(range="1001.5"), row(state="DEGRADED", soc="")]
-    found = golden.differences(before, now, golden.TOLERANCE)
-    assert [(d.field, d.golden, d.now) for d in found] == [
-        ("range", "1000", "1001.5"),
-        ("soc", "0.5", ""),
-        ("state", "VALID", "DEGRADED"),
-    ]
-    text = golden.told(found, len(now))
-    assert "range: 1 of 3 rows differ by more than 0.5" in text
-    assert "+1.5" in text
-    assert "DEGRADED" in text
-
-
-def test_rows_and_fields_that_come_or_go_are_differences():
-    assert golden.differences([], [row()], golden.TOLERANCE)
-    assert golden.differences([row()], [row(), row()], golden.TOLERANCE)
-    assert golden.differences([row()], [row(new="1")], golden.TOLERANCE)
-    assert golden.differences([row(soc="nan")], [row()], golden.TOLERANCE)
-    assert not golden.differences([row(range="1000.4")], [row()], golden.TOLERANCE)
-
-
 def test_regenerate_writes_what_then_agrees_and_tells_what_moved(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(golden, "GOLDEN", tmp_path)
     name = SHORTEST.stem
