@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.can.codec import CONFLICT, COUNTER, CRC, LENGTH, LONGEST_PAUSE_NS, NOT_AVAILABLE, RANGE, TIME, Codec
 from gz_onboard.can.layout import crc8_sae_j1850, identifiers_of
-from gz_onboard.can.mapping import BusMapping, Source, read_mapping, to_si
+from gz_onboard.can.mapping import BusMapping, Source, read_mapping
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Frame
 from gz_onboard.export.decoder import Decoder
 from gz_onboard.toml import Table
@@ -498,75 +498,3 @@ def test_a_page_that_the_dbc_does_not_list_keeps_the_signals_of_every_page(tmp_p
     rows = [row for _, _, row in Decoder(mapping).decode([frames])]
     assert [row["Cell[V]"] for row in rows] == [pytest.approx(3.7)] + [None] * 19
     assert all(row["Amps[A]"] == pytest.approx(-24.0) for row in rows)
-
-
-# --- never an exception, never a wrong number ---------------------------------------------------------------------
-
-KNOWN = sorted(m.frame_id for m in reference().database.messages)
-identifiers = st.one_of(
-    st.sampled_from(KNOWN),
-    st.sampled_from(KNOWN).flatmap(lambda i: st.sampled_from([i | EFF_FLAG, i | RTR_FLAG, i | ERR_FLAG])),
-    st.integers(0, 2**32 - 1),
-)
-payloads = st.one_of(
-    st.binary(min_size=8, max_size=8),
-    st.binary(max_size=64),
-    st.binary(min_size=7, max_size=7).map(lambda d: d + bytes([crc8_sae_j1850(d)])),
-    st.sampled_from([b"\xff" * 8, bytes(8), b"\x00\x80" * 4, b"\xff\x7f" * 4]),
-)
-steps = st.one_of(st.integers(0, 200 * MS), st.integers(-S, S), st.integers(-(2**62), 2**62), st.just(None))
-
-
-@st.composite
-def recordings(draw: st.DrawFn) -> list[tuple[int, int, bytes, int]]:
-    time = draw(st.sampled_from([0, EPOCH, 2**62]))
-    frames = []
-    for step, identifier, data in draw(st.lists(st.tuples(steps, identifiers, payloads), max_size=60)):
-        time = 0 if step is None else max(-(2**63), min(time + step, 2**63 - 1))
-        frames.append((time, identifier, data, draw(st.integers(0, 1))))
-    return frames
-
-
-def limits_of(mapping: BusMapping, source: Source) -> tuple[float, float]:
-    """The limits that the DBC gives to a signal, in the unit of its role."""
-    signal = mapping.database.get_message_by_name(source.message).get_signal_by_name(source.signal)
-    factor, offset = to_si(signal.unit or "", source.role) or (math.nan, math.nan)
-    assert signal.minimum is not None and signal.maximum is not None
-    low, high = sorted((signal.minimum * factor + offset, signal.maximum * factor + offset))
-    slack = 1e-9 * max(abs(low), abs(high))
-    return low - slack, high + slack
-
-
-def accounted(codec: Codec) -> int:
-    frame_faults = sum(n for (_, reason), n in codec.faults.items() if reason not in (NOT_AVAILABLE, RANGE))
-    return frame_faults + sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames + codec.copies
-
-
-@settings(max_examples=300, deadline=None)
-@given(recordings())
-def test_whatever_the_bus_brings(frames):
-    mapping = reference()
-    codec = Codec(mapping)
-    by_role = {source.role: limits_of(mapping, source) for source in mapping.sources}
-    roleless = {m.frame_id for m in mapping.database.messages} - {
-        mapping.database.get_message_by_name(s.message).frame_id for s in mapping.sources
-    }
-    for n, frame in enumerate(frames, 1):
-        before = accounted(codec)
-        events = events_of(codec, [frame])
-        counted = accounted(codec) - before
-        quiet = frame[1] in roleless and len(frame[2]) == 8 and not counted
-        assert len(events) + counted + quiet == 1
-        assert codec.received == n
-        for time, group, values in events:
-            assert math.isfinite(time)
-            assert len(values) == len(codec.groups[group].roles)
-            absent = [role for role, v in zip(codec.groups[group].roles, values, strict=True) if v is None]
-            for role, value in zip(codec.groups[group].roles, values, strict=True):
-                if value is not None:
-                    low, high = by_role[role]
-                    assert low <= value <= high, (role, value)
-            assert not absent or any(r in (NOT_AVAILABLE, RANGE) for _, r in codec.faults)
-        if origin := codec.origins.find(frame[1]):
-            assert all(v is None or math.isfinite(v) for v in codec.values(origin.message.name, frame[2]).values())
-    assert {reason for _, reason in codec.faults} <= {LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -60,15 +59,6 @@ def link(name: str) -> str:
     return output("ip", "-o", "link", "show", name, check=False)
 
 
-@contextlib.contextmanager
-def bus_down() -> Iterator[None]:
-    output("ip", "link", "set", "vcan0", "down")
-    try:
-        yield
-    finally:
-        output("ip", "link", "set", "vcan0", "up")
-
-
 class Listener:
     """The daemon's frames as anyone on vcan0 sees them."""
 
@@ -76,16 +66,8 @@ class Listener:
         database = load_file(ROOT / "dbc" / "range.dbc")
         assert isinstance(database, Database)
         self.database = database
-        self.bus = self._open()
-
-    def _open(self) -> can.BusABC:
-        filters = [can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF) for m in self.database.messages]
-        return can.Bus(interface="socketcan", channel="vcan0", can_filters=filters)
-
-    def reopen(self) -> None:
-        """After the interface was down, a socket of python-can reports that once more."""
-        self.bus.shutdown()
-        self.bus = self._open()
+        filters = [can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF) for m in database.messages]
+        self.bus = can.Bus(interface="socketcan", channel="vcan0", can_filters=filters)
 
     def next(self, signal: str, seconds: float = 10.0) -> dict[str, Any]:
         """The next frame, from now on, that has `signal`, decoded."""

@@ -6,22 +6,19 @@ import os
 import signal
 import socket
 import struct
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import pytest
 
-from gz_onboard import state
-from gz_onboard.can.recorder import is_complete
 from gz_onboard.events import State
-from tests.support import LOGS, S, Scooter, recorded, reference, ridden
-from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
+from tests.support import S, Scooter
+from tests.vcan.support import Daemon, Listener, Running, ip, number, raw_frames, wait_for
 
 FRAME = struct.Struct("=IB3x8s")
 
@@ -63,12 +60,7 @@ def steady_ride(*channels: str) -> Iterator[list[float]]:
     failures: list[float] = []
 
     def ride() -> None:
-        sockets = []
-        for name in names:
-            raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-            raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
-            raw.bind((name,))
-            sockets.append(raw)
+        sockets = [opened.enter_context(sender(name)) for name in names]
         frames = Scooter().steady(15.0, hbm=len(names) - 1)
         begin, first = time.monotonic(), frames[0][0]
         while not stopping.is_set():
@@ -83,67 +75,36 @@ def steady_ride(*channels: str) -> Iterator[list[float]]:
                 except OSError:
                     failures.append(time.monotonic())
             begin += 15.0  # as many frames of each message as make its counter run on
-        for raw in sockets:
-            raw.close()
 
-    thread = threading.Thread(target=ride)
-    thread.start()
-    try:
-        yield failures
-    finally:
-        stopping.set()
-        thread.join()
+    with ExitStack() as opened:
+        thread = threading.Thread(target=ride)
+        thread.start()
+        try:
+            yield failures
+        finally:
+            stopping.set()
+            thread.join()
 
 
 def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: Listener):
-    city = LOGS / "city_14C.blf"
-    # What 200 s of the same ride have taught, as a daemon that was killed then would have saved it.
-    on_the_way = recorded("city_14C", 0.0, 300.0)
-    first_ns = on_the_way[0][0]
-    learned = ridden([frame for frame in on_the_way if frame[0] < first_ns + 200 * S])
-    snapshot = learned.pipeline.estimator.snapshot(reference().key)
-    assert snapshot is not None
-    folder = running.folder("a")
-    uptime = time.clock_gettime(time.CLOCK_BOOTTIME)  # the guest has no clock of its own: without it no age is known
-    state.write(folder / f"{reference().name}.json", state.encode(snapshot, time.time(), uptime))
     daemon = running.daemon()
-    assert "continuing from the state saved" in daemon.journal
-    replay = running.replay(city, "--from", "200")
-    listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    with hold_ups() as held_up:
-        time.sleep(14)  # the state is saved at least every 10 s
+    with steady_ride(), hold_ups() as held_up:
+        listener.wait_for_valid(2)
+        time.sleep(12)  # the state is saved at least every 10 s
         before = listener.decoded("RANGE_Status")[-1]
         killed_ns = time.time_ns()
         daemon.process.kill()
         daemon.process.wait()
-
-    frames = raw_frames(daemon.logs[-1])
-    assert killed_ns - frames[-1][0] < (3 + 4 * max(held_up)) * S  # what is lost: 2 s on a machine that has the time
-    first_log = daemon.logs[-1]
-    rows = daemon.estimates(first_log)
-    habit = snapshot["riding"]["state"]["habits"]["factor"]
-    factor = habit["level"] + habit["deviation"]
-    assert rows[-1]["consumption_factor"] == pytest.approx(factor, abs=0.03)
-    assert rows[-1]["consumption_factor_sd"] < 0.08  # the prior has 0.085
-
-    daemon = running.daemon()
-    after = listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    status = listener.decoded("RANGE_Status")[-1]
-    time.sleep(3)
-    replay.kill()
+        first_log = daemon.logs[-1]
+        daemon = running.daemon()
+        assert "continuing from the state saved" in daemon.journal
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+        after = listener.decoded("RANGE_Status")[-1]
     daemon.stop()
-    assert status["RANGE_StateOfChargeSigma"] == pytest.approx(before["RANGE_StateOfChargeSigma"], abs=0.2)
-    assert after["RANGE_RemainingP10"] < after["RANGE_Remaining"] < after["RANGE_RemainingP90"]
-    again = daemon.estimates()
     assert daemon.logs[-1] != first_log
-    assert again[-1]["consumption_factor"] == pytest.approx(rows[-1]["consumption_factor"], abs=0.03)
-    assert again[-1]["consumption_factor_sd"] == pytest.approx(rows[-1]["consumption_factor_sd"], abs=0.005)
-    # As if it had not been killed: what was ridden in between is not lost, however long the machine took.
-    whole = ridden(on_the_way)
-    soc = {round((time_ns - first_ns) / S): row["soc"] for name, time_ns, row in whole.samples if name == "/estimate"}
-    row = again[-1]
-    in_ride = 200 + round((row["time_ns"] - frames[0][0]) / S)
-    assert row["soc"] == pytest.approx(soc[in_ride], abs=0.002)
+    assert killed_ns - raw_frames(first_log)[-1][0] < (3 + 4 * max(held_up)) * S  # what is lost
+    assert after["RANGE_StateOfCharge"] == pytest.approx(before["RANGE_StateOfCharge"], abs=0.3)
+    assert after["RANGE_StateOfChargeSigma"] == pytest.approx(before["RANGE_StateOfChargeSigma"], abs=0.2)
 
 
 @pytest.mark.administers
@@ -158,7 +119,7 @@ def test_bus_down_and_up(running: Running, listener: Listener):
         ip("link", "set", "vcan0", "up")
         time.sleep(4)
         assert failures
-    assert daemon.process.poll() is None
+    check_taken_away_and_back(daemon, listener)
     daemon.stop()
     rows = {round((row["time_ns"] - went_down) / S): row for row in daemon.estimates()}
     during = [rows[t] for t in (3, 4, 5)]
@@ -168,9 +129,7 @@ def test_bus_down_and_up(running: Running, listener: Listener):
     assert after
     assert all("BUS_DOWN" not in row["reasons"] for row in after)
     assert "BUS_DOWN" in daemon.journal
-    heard = [frame[0] for frame in listener.frames if frame[0] > came_up]
-    assert heard
-    assert heard[0] < came_up + 3 * S
+    assert any(came_up < frame[0] < came_up + 4 * S for frame in listener.frames)
     soc = [row["soc"] for row in daemon.estimates() if row["soc"] is not None]
     assert all(abs(b - a) < 0.002 for a, b in pairwise(soc))
 
@@ -185,14 +144,10 @@ def open_files(pid: int, seconds: float = 1.5) -> int:
     return min(counts)
 
 
-@pytest.mark.administers
-def test_the_interface_is_taken_away_and_comes_back(running: Running, listener: Listener):
-    daemon = running.daemon()
-    with steady_ride():
-        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+def check_taken_away_and_back(daemon: Daemon, listener: Listener) -> None:
+    """The interface is deleted and made again: the daemon neither ends nor leaks files, and hears it again."""
     ip("link", "delete", "vcan0")
-    time.sleep(3)
-    assert daemon.process.poll() is None
+    time.sleep(2)
     first = open_files(daemon.process.pid)
     time.sleep(2)
     assert open_files(daemon.process.pid) <= first  # after four attempts and more to open what is not there
@@ -200,8 +155,7 @@ def test_the_interface_is_taken_away_and_comes_back(running: Running, listener: 
     ip("link", "set", "vcan0", "up")
     with steady_ride():
         listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    assert "not properly shut down" not in daemon.journal
-    daemon.stop()
+    assert daemon.process.poll() is None
 
 
 def dropped_on_the_way() -> int:
@@ -238,18 +192,6 @@ def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
     told = [row for row in listener.decoded("RANGE_Status") if row["RANGE_FramesLost"]]
     assert len(told) >= 9  # a second; another loss while it catches up begins that anew
     assert listener.decoded("RANGE_Diagnosis")[-1]["RANGE_CountLost"] == min(lost, 4094)
-
-
-def test_the_log_directory_cannot_be_written(running: Running, listener: Listener):
-    blocked = running.folder("a") / "file"
-    blocked.write_text("in the way")
-    daemon = running.daemon("--log-dir", str(blocked))
-    with steady_ride():
-        found = listener.wait_for_new("RANGE_Status", 10, RANGE_LogFailed=1, RANGE_StatusState=State.VALID)
-        assert found["RANGE_StateOfCharge"] <= 100
-        wait_for(lambda: "LOG_FAILED" in daemon.journal, 5, "the daemon says that it cannot write its log")
-    daemon.stop()
-    assert f"cannot write the log: [Errno 17] File exists: '{blocked}'" in daemon.journal
 
 
 def test_stopped_for_long_it_tells_nothing_old(running: Running, listener: Listener):
@@ -319,34 +261,3 @@ def test_the_clock_is_set(running: Running, listener: Listener):
     assert "implausible time" not in daemon.statuses()[-1]["faults"]
     soc = [row["soc"] for row in riding if row["soc"] is not None]
     assert max(soc) - min(soc) < 0.005
-
-
-@pytest.mark.administers
-def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
-    """Others fill it, and room again: the log leaves them their share, and goes on in a new file."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=False, capture_output=True
-    )
-    if mount.returncode:
-        pytest.skip(f"no mount here: {mount.stderr.decode()}")
-    try:
-        daemon = running.daemon("--log-dir", str(disk))
-        with steady_ride():
-            listener.wait_for_valid(4)
-            assert not listener.decoded("RANGE_Status")[-1]["RANGE_LogFailed"]
-            (disk / "ballast").write_bytes(bytes(1_800_000))
-            listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
-            wait_for(lambda: "cannot write the log" in daemon.journal, 10, "it says that the disk is full")
-            (disk / "ballast").unlink()
-            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
-            time.sleep(3)
-        daemon.stop()
-        logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
-        assert len(logs) >= 2
-        assert all(is_complete(log) for log in logs)
-        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))
-    finally:
-        running.kill()
-        subprocess.run(["umount", str(disk)], check=False)
