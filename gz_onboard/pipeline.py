@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from gz_onboard.can.codec import DROPPING, RANGE, Codec
 from gz_onboard.can.origins import Origins
@@ -64,6 +65,17 @@ def filter_backend(name: str) -> Backend:
     return FILTERPY
 
 
+@dataclass(frozen=True)
+class SystemHealth:
+    """Bus and disks around the pipeline, as the daemon sees them; frames are counted since its start."""
+
+    kernel_lost: int = 0
+    overrun: int = 0  # left out by the daemon: too many, or stamped while the clock was set
+    send_failures: int = 0  # that a channel did not take
+    log_lost: int = 0  # that are in no log
+    reasons: Reason = field(default=Reason(0))  # bus down, log or state not written
+
+
 class Pipeline:
     """Turns the frames of one vehicle into estimates.
 
@@ -87,11 +99,7 @@ class Pipeline:
             self.codec.groups, vehicle.pack, vehicle.model, vehicle.riding, filter_backend(filter_name)
         )
         self.publisher = range_publisher(vehicle)
-        self.kernel_lost = 0  # frames; set by the daemon
-        self.overrun = 0  # frames that the daemon left out; set by the daemon
-        self.log_lost = 0  # frames that are in no log; set by the daemon
-        self.send_failures = 0  # frames that a channel did not take; set by the daemon
-        self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
+        self.health = SystemHealth()  # replaced by the daemon
         self.energy = EnergyCounter()
         self.last: Estimate | None = None
         self.last_known: Estimate | None = None  # the last that had a range
@@ -159,10 +167,9 @@ class Pipeline:
                 self._recent |= Reason.FRAMES_LOST
         self.estimator.step(windows)
         estimate = self.estimator.estimate(now)
-        if self._recent or self.extra_reasons:
-            estimate.reasons |= self._recent | self.extra_reasons
-            if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
-                estimate.state = State.DEGRADED
+        estimate.reasons |= self._recent | self.health.reasons
+        if self.health.reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
+            estimate.state = State.DEGRADED
         self.last = estimate
         self.energy.add(estimate)
         if estimate.range is not None and estimate.state in KNOWN:
@@ -191,7 +198,7 @@ class Pipeline:
         return Counts(
             dropped=sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING),
             implausible=sum(n for (_, reason), n in codec.faults.items() if reason == RANGE),
-            lost=self.kernel_lost + self.overrun + sum(codec.lost.values()),
+            lost=self.health.kernel_lost + self.health.overrun + sum(codec.lost.values()),
             unknown=len(codec.unknown),
         )
 
@@ -221,7 +228,7 @@ class Pipeline:
 
     def status(self) -> dict[str, object]:
         """Return the counts since the start by message and reason, the ride so far, and the learned values."""
-        codec, estimator, last = self.codec, self.estimator, self.last or Estimate(0.0)
+        codec, health, estimator, last = self.codec, self.health, self.estimator, self.last or Estimate(0.0)
         ambient = estimator.signals.ambient_temperature.get(last.time)
         faults: dict[str, dict[str, int]] = {}
         for (message, reason), count in sorted(codec.faults.items()):
@@ -229,10 +236,10 @@ class Pipeline:
         return {
             "received": codec.received,
             "error_frames": codec.error_frames,
-            "kernel_lost": self.kernel_lost,
-            "overrun": self.overrun,
-            "send_failures": self.send_failures,
-            "log_lost": self.log_lost,
+            "kernel_lost": health.kernel_lost,
+            "overrun": health.overrun,
+            "send_failures": health.send_failures,
+            "log_lost": health.log_lost,
             "unknown_others": codec.unknown_others,
             "copies": codec.copies,
             "foreign": self.foreign,

@@ -290,8 +290,8 @@ def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest
             ticks += [(last.time, time.monotonic())] if last else []
     channel.close()
     assert ahead
-    assert daemon.pipeline.codec.received + daemon.pipeline.overrun == 4
-    assert daemon.pipeline.overrun == 3
+    assert daemon.pipeline.codec.received + daemon.pipeline.health.overrun == 4
+    assert daemon.pipeline.health.overrun == 3
     assert all(0 <= b[0] - a[0] <= WINDOW + 1e-6 for a, b in pairwise(ticks)), ticks
     assert ticks[-1][0] - ticks[0][0] == pytest.approx(ticks[-1][1] - ticks[0][1], abs=WINDOW + 0.21)
 
@@ -377,9 +377,9 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
             thread.join()
     last = [row for row in check_frames(scene.heard)["RANGE_Status"] if row["RANGE_FramesLost"]]
     assert any(row["RANGE_StatusState"] == State.VALID for row in last)
-    assert daemon.pipeline.overrun > 1000
-    assert daemon.pipeline.counts().lost >= daemon.pipeline.overrun
-    assert daemon.pipeline.status()["overrun"] == daemon.pipeline.overrun
+    assert daemon.pipeline.health.overrun > 1000
+    assert daemon.pipeline.counts().lost >= daemon.pipeline.health.overrun
+    assert daemon.pipeline.status()["overrun"] == daemon.pipeline.health.overrun
 
 
 def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

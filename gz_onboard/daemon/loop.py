@@ -25,7 +25,7 @@ from gz_onboard.daemon.control import Control
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.log_rows import reason_names
 from gz_onboard.notify import notify, watchdog_interval
-from gz_onboard.pipeline import Pipeline
+from gz_onboard.pipeline import Pipeline, SystemHealth
 from gz_onboard.vehicle import Vehicle
 
 TICK = 0.1  # s, the period of the status frame; a wake-up costs as much as ten frames
@@ -170,17 +170,18 @@ class Daemon:
     def step(self, frames: list[Frame], now_ns: int) -> None:
         """Process frames, in the order of their times, up to `now_ns`; send, record and save the results."""
         pipeline = self.pipeline
-        pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
-        pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
-        pipeline.overrun = self._overrun
-        if self._log:
-            pipeline.log_lost = self._log.lost_frames
         problems = {
             Reason.BUS_DOWN: not all(channel.up for channel in self.channels),
             Reason.LOG_FAILED: self._log and self._log.error,
             Reason.SAVE_FAILED: self._keeper and self._keeper.error,
         }
-        pipeline.extra_reasons = Reason(sum(reason for reason, found in problems.items() if found))
+        pipeline.health = SystemHealth(
+            kernel_lost=sum(channel.overflow for channel in self.channels),
+            overrun=self._overrun,
+            send_failures=sum(channel.send_failures for channel in self.channels),
+            log_lost=self._log.lost_frames if self._log else 0,
+            reasons=Reason(sum(reason for reason, found in problems.items() if found)),
+        )
         self.control.take()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
