@@ -17,12 +17,3 @@ def test_a_charger_is_not_riding():
     assert energy.charged == pytest.approx(200 * 53 * 10)
     assert energy.net == pytest.approx(199 * 50 * 8 - energy.recovered)
     assert energy.missing == 0
-
-
-def test_a_log_of_charging_alone_has_energy_nothing():
-    """And not something that is not known."""
-    energy = EnergyCounter()
-    for i in range(11):
-        energy.add(Estimate(float(i), pack_voltage=53.0, pack_current=-10.0, activity=Activity.CHARGING))
-    assert (energy.net, energy.recovered) == (0.0, 0.0)
-    assert energy.charged == pytest.approx(5300)

@@ -8,8 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.model.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.life import CELLS, GROUPS, MOTOR, PACK, Scooter
@@ -17,7 +15,6 @@ from tests.events import EventEstimator
 from tests.support import joined, without_cell_effects
 
 BASE = without_cell_effects(read_vehicle("reference", 75.0))
-AIR = Conditions(20.0, 0.0)
 
 
 def extended(*names: str, **values: float) -> Vehicle:
@@ -41,9 +38,6 @@ def run(vehicle, seconds, change=lambda events: events):
             if found is not None:
                 innovations.append(found)
     return e, np.array(innovations)
-
-
-# --- the ledger ---------------------------------------------------------------------------------------------------
 
 
 # --- effects in the cells -----------------------------------------------------------------------------------------
@@ -133,44 +127,3 @@ def test_voltage_and_current_out_of_step_are_paired(late):
     jumps = [float(np.std(np.diff(values))) for values in (true, mended, off)]  # what is slow has other causes
     assert jumps[1] < 1.5 * jumps[0]
     assert jumps[2] > 2 * jumps[0]
-
-
-# --- the way to come ----------------------------------------------------------------------------------------------
-
-
-def ride(f, truth, kilometres, *, heading=0.0, radius=0.0):
-    """Stop and go; the pack delivers what the model `truth` says, with every other bend to the left."""
-    x = v = moving = 0.0
-    target = 10.0
-    while x < kilometres * 1000:
-        target = 0.2 if x % 500 > 450 and target > 0.2 else 10.0 if v < 0.3 else target
-        a = min(max(0.5 * (target - v), -1.2), 0.9)
-        lateral = (1 if x % 200 < 100 else -1) * v * v / radius if radius else 0.0
-        moving += 0.1 if v > 0.5 else 0.0
-        air = AIR._replace(lateral_acceleration=lateral, heading=heading)
-        q = f.load.quantities(v, a, AIR) | {"lateral_acceleration": lateral, "heading": heading}
-        power = sum(truth.power(q | {"time_moving": moving}).values())
-        f.learner.ride(0.1, v, 0.0, power, air)
-        x += v * 0.1
-        v += a * 0.1
-    return f
-
-
-def forecaster(vehicle):
-    return Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
-
-
-def test_of_the_wind_the_mean_over_all_headings_is_expected():
-    vehicle = extended("headwind", wind_north=4.0)
-    north, south = (ride(forecaster(vehicle), vehicle.model, 4, heading=h) for h in (0.0, math.pi))
-    calm = ride(forecaster(BASE), BASE.model, 4)
-    sums = [f.learner.state.sums for f in (south, calm, north)]
-    measured = [s.measured / s.distance for s in sums]
-    assert measured[0] < 0.9 * measured[1] < 0.81 * measured[2]
-    for f in (north, south):
-        assert f.learner.factor == pytest.approx(1.0, abs=0.04)
-    levels = [s.level / s.distance for s in sums]
-    assert levels[0] == pytest.approx(levels[2], rel=1e-6)  # the same to come, wherever from
-    # The mean of (v + w·cos ψ)² over all ψ is v² + w²/2.
-    more = 0.5 * 1.2 * BASE.parameters["drag_area"] * 4.0**2 / 2
-    assert levels[2] - levels[1] == pytest.approx(more, rel=0.35)  # and what the motor takes for it

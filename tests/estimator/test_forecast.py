@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from math import exp
 
 import numpy as np
@@ -93,28 +92,11 @@ def test_a_climb_is_not_taken_for_consumption():
     assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
 
 
-def test_uncertainty_of_soc_widens_the_interval():
-    f = forecaster()
-    narrow, wide = f.forecast(0.5, 0.005, 25.0, 1.0, 20.0, 0.0), f.forecast(0.5, 0.05, 25.0, 1.0, 20.0, 0.0)
-    assert wide.energy_sd > 3 * narrow.energy_sd
-    assert wide.p90 - wide.p10 > narrow.p90 - narrow.p10
-
-
 def test_empty_is_zero_with_an_upper_bound():
     result = forecast(forecaster(), soc=0.0)
     assert result.range == 0.0
     assert result.p10 == 0.0
     assert 0 < result.p90 < 3000
-
-
-def test_snapshot_goes_on_as_if_nothing_had_been():
-    a, b = forecaster(), forecaster()
-    ride(a, 6)
-    b.restore(json.loads(json.dumps(a.snapshot())))
-    assert forecast(b).range == pytest.approx(forecast(a).range, rel=0.02)
-    ride(a, 3, seed=1)
-    ride(b, 3, seed=1)
-    assert forecast(b).range == pytest.approx(forecast(a).range, rel=0.02)
 
 
 def test_coverage_of_the_interval():

@@ -117,16 +117,6 @@ def test_without_any_source_a_quantity_is_none():
     assert motion.speed == pytest.approx(0.0)
 
 
-def test_speed_by_whatever_there_is():
-    for missing in (("motor_speed",), ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed")):
-        motion, _ = drive(60, hill, without=missing)
-        assert motion.speed == pytest.approx(8.0)
-    everything = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
-    motion, _ = drive(60, hill, without=everything)
-    assert motion.speed is None
-    assert motion.acceleration is None
-
-
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.25, 1.0])
 def test_a_steady_acceleration_is_shown_as_it_is_whatever_the_step(dt):
     signals = ShownSignals("motor_speed")

@@ -11,7 +11,6 @@ from gz_onboard.estimator.battery_priors import PRIOR, VoltageNoise
 from gz_onboard.estimator.plausibility.electrical import CurrentSource
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES, Reason
-from gz_onboard.model.functions import PiecewiseLinear
 from gz_onboard.model.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
 from tests.events import ShownSignals
@@ -67,15 +66,6 @@ def test_a_signal_that_is_left_out_or_stale_is_a_reason():
     signals.motor_speed.time = -10.0
     assert missing(1.0) == Reason.NO_IMU | Reason.NO_GPS
     assert missing(10.0) & Reason.NO_SPEED
-
-
-def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
-    """6 mV that stay are worth 5 % of charge where the curve rises by 0.1 V over 80 %, however often they are seen."""
-    flat = replace(VEHICLE.pack, ocv_curve=PiecewiseLinear((0.0, 0.1, 0.9, 1.0), (2.5, 3.2, 3.3, 3.6)))
-    history = VoltageNoise(flat, VEHICLE.parameters).history
-    assert flat.ocv(0.5)[1] ** 2 * 0.03**2 < history
-    assert flat.ocv(0.5)[1] ** 2 * 0.10**2 > history
-    assert flat.ocv(0.05)[1] ** 2 * 0.03**2 > history
 
 
 def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gz_onboard.estimator.explanation import RangeExplainer
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.motion import Motion
-from gz_onboard.estimator.route import PreparedRoute, RouteForecaster
+from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.events import Cause, Explanation, RouteState
 from gz_onboard.model.drawable import Drawable
 from gz_onboard.routes.route import Route
@@ -179,26 +177,6 @@ def test_an_empty_battery_has_no_range():
     found, answer = Rider(way(5e3)).settled(FREE._replace(left=Drawable(0.0, 6e6, 0.02), energy_sd=3e4), soc=0.02)
     assert found.range == found.p10 == 0.0 < found.p90 < 2e3
     assert (answer.arrival_soc, answer.battery_ends_after) == (0.0, 0.0)
-
-
-@given(
-    costs=st.lists(st.floats(-5e3, 2e4).map(round), min_size=2, max_size=30),
-    start=st.floats(0, 0.99),
-    given_=st.floats(1, 1e5),
-)
-def test_reach_is_where_the_energy_is_first_used_up(costs, start, given_):
-    energy = object.__new__(PreparedRoute)
-    energy._np, energy.distance = np, np.arange(len(costs) + 1) * 20.0
-    total = np.concatenate(([0.0], np.cumsum(costs)))
-    begin = start * energy.distance[-1]
-    found = energy.reach(total, begin, given_)
-    fine = np.union1d(np.linspace(begin, energy.distance[-1], 4000), energy.distance[energy.distance > begin])
-    used = np.interp(fine, energy.distance, total) - np.interp(begin, energy.distance, total)
-    over = np.flatnonzero(used >= given_ - 1e-6)
-    if found is None:
-        assert used[-1] <= given_ + 1e-6
-    else:
-        assert begin + found == pytest.approx(fine[over[0]], abs=2 * np.max(np.diff(fine)) + 1e-6)
 
 
 def test_the_charge_at_arrival_is_that_which_will_be_shown_there():

@@ -102,13 +102,6 @@ def test_it_can_be_joined_anywhere():
     assert seen[-1] == pytest.approx(1900, abs=5)
 
 
-def test_without_fixes_the_distance_counts():
-    position = RoutePosition(route(STRAIGHT))
-    for _ in range(20):
-        position.update(STEP, None, None)
-    assert (position.along, position.on) == (200.0, True)
-
-
 def test_a_tunnel_is_bridged():
     position = RoutePosition(route([(0, 0), (0, 4000)]))
     ride(position, [(0, 0), (0, 1000)])

@@ -86,18 +86,6 @@ def test_a_jump_from_a_start_up_value_is_accepted():
     assert shown(0.0, *[50.0] * 40, 0.0) == [True] * 41 + [False]
 
 
-@pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])
-@pytest.mark.parametrize("gap", [10.0, 20.0, 40.0])
-def test_what_flowed_in_a_pause_is_covered(gap, speed):
-    scooter, e = Scooter(soc=0.7, seed=1), estimator()
-    follow(e, scooter.live(60), scooter)
-    set_soc(e, scooter.soc, 1e-8, 1e-8)
-    scooter.away(gap, speed)
-    e.handle(next(scooter.live(0.1, speed)))
-    e.close()
-    assert abs(e.pack.state.soc - scooter.soc) < 2 * e.pack.state.covariance[0] ** 0.5
-
-
 @pytest.mark.parametrize("latency", [0.0, 0.2])
 @pytest.mark.parametrize("period", [0.1, 1.0, 3.0])
 def test_a_late_voltage_is_used_however_seldom_it_comes(period, latency):

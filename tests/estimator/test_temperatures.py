@@ -76,8 +76,3 @@ def test_air_that_is_not_measured_is_as_much_colder_than_the_cells_as_their_heat
     assert e._temperatures.ambient(299.9) == pytest.approx(AMBIENT, abs=2.5)
     never = ridden(VEHICLE, 10.0, cells=1e9, air=0.0)
     assert never._temperatures.ambient(9.9) == pytest.approx(CELLS, abs=0.1)
-
-
-def test_cells_that_were_never_measured_warm_from_the_airs_temperature() -> None:
-    e = ridden(VEHICLE, 200.0, cells=0.0)
-    assert e._temperatures.step(200.0, 0.0, e.pack.heat) > AMBIENT + 1.0
