@@ -35,7 +35,7 @@ from gz_onboard.errors import InputError, brief, not_an_input, writing
 from gz_onboard.estimation import summary as summaries
 from gz_onboard.estimation.report import ReportedRide, check_page, page_of, report_of, section_of
 from gz_onboard.estimation.ride import MemoryLog, RideOptions, open_estimate, run_ride, state_for
-from gz_onboard.estimation.saved_state import held, save_state
+from gz_onboard.estimation.saved_state import locked, save_state
 from gz_onboard.estimation.summary import RideSummary
 from gz_onboard.estimator.pack_age import LearnedFactor
 from gz_onboard.events import Frame
@@ -248,7 +248,7 @@ def estimate(
     else:
         file, facts = Path(state), facts_of(given) if isinstance(given, Path) else {}
         not_an_input(state_files.copies(file), [given] if isinstance(given, Path) else [])
-        with held(file):
+        with locked(file):
             run = run_ride(ride, replace(options, state=state_for(file, ride, facts)), log, progress)
             save_state(file, run.pipeline)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 from math import log
 
 from gz_onboard.errors import InputError, nearest, shown
@@ -42,14 +43,13 @@ def correlations(vehicle: Vehicle) -> dict[frozenset[str], float]:
         rows = table.rows("value", n, "as many as parameters", -1, 1)
         if len(rows) != n:
             raise table.error(f"must be {n} rows of {n} numbers, as many as parameters", "value")
+        for (i, row), (j, column) in product(enumerate(rows), enumerate(rows)):
+            if row[j] != column[i]:
+                raise table.error(f"row {i + 1}, column {j + 1}: {row[j]:g} is not symmetric", "value")
         for i, row in enumerate(rows):
-            for j, r in enumerate(row):
-                if r != rows[j][i]:
-                    raise table.error(f"row {i + 1}, column {j + 1}: {r:g} is not symmetric", "value")
-                if i == j and r != 1:
-                    raise table.error(f"the diagonal must be 1, is {r:g}", "value")
-                if i != j:
-                    found[frozenset((names[i], names[j]))] = r
+            if row[i] != 1:
+                raise table.error(f"the diagonal must be 1, is {row[i]:g}", "value")
+        found |= {frozenset((names[i], names[j])): rows[i][j] for i, j in combinations(range(n), 2)}
         if np.linalg.eigvalsh(rows)[0] < -0.01:  # by more than the rounding to two digits
             raise table.error("no parameters can have these correlations together: a variance is negative", "value")
     return found

@@ -9,7 +9,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 
 import gz_onboard as gz
-from gz_onboard import api, cli, state
+from gz_onboard import api, cli
 from tests.support import LOGS, ROOT
 from tests.test_learned import CAPACITY, saved
 
@@ -53,17 +52,6 @@ def test_a_result_prints_as_its_command_and_is_short_otherwise(tmp_path, capsys)
     assert len(repr(simulated)) < 5000
 
 
-def test_nothing_of_the_api_shows_thousands_of_numbers():
-    found, ride = gz.discover(LOGS / "city_34C.blf"), gz.estimate(COASTDOWN)
-    bench = gz.calibrate([LOGS / "calibration" / "motor_dyno.csv.gz"], procedure="motor")
-    simulated = gz.simulate("ece15")
-    told = [gz.read_vehicle("reference"), gz.read_ride(COASTDOWN), ride.estimates, found, found.report, found.found]
-    for one in [*told, simulated.run, *bench.results]:
-        assert repr(one).startswith(f"{type(one).__name__}(")
-        assert 40 < len(repr(one)) < 3000
-    assert "verdict='cause'" in repr(found)
-
-
 def test_the_names_are_those_of_the_api():
     assert sorted(set(gz.__all__) - {"__version__"}) == sorted(api.__all__)
     assert set(gz.__all__) <= set(dir(gz))
@@ -96,27 +84,12 @@ def test_every_page_of_the_documentation_runs(tmp_path, monkeypatch):
 def test_an_estimate_is_that_of_the_command(tmp_path, capsys):
     assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path), "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)["rides"]
-    assert cli.main(["export", str(tmp_path / "coastdown.estimate.mcap"), str(tmp_path / "told.parquet")]) == 0
-    capsys.readouterr()
     ride = gz.estimate(COASTDOWN)
     assert capsys.readouterr() == ("", "")
     differ = {"log", "cpu_s", "real_time_factor"}
     assert {key: getattr(ride.summary, key) for key in told.keys() - differ - {"why", "changes"}} == {
         key: value for key, value in told.items() if key not in differ | {"why", "changes"}
     }
-    import pyarrow.parquet
-
-    exported = pyarrow.parquet.read_table(tmp_path / "told.parquet")
-    table = ride.to_table()
-    assert list(table) == exported.column_names
-    for name, values in table.items():
-        column = exported[name].to_pylist()
-        if name == "time":
-            assert values.astype("int64").tolist() == exported[name].cast("int64").to_pylist()
-        elif values.dtype.kind == "O":
-            assert values.tolist() == column
-        else:
-            np.testing.assert_array_equal(values, np.array([np.nan if x is None else x for x in column]))
 
 
 def test_estimates_in_a_log_are_those_that_were_made(tmp_path):
@@ -149,44 +122,10 @@ def test_a_validation_is_that_of_the_command(capsys):
     table = found.to_table()
     assert found.passed == told["passed"]
     assert len(table["ride"]) == sum(len(told[f]["channels"]) for f in ("open_loop", "predictive", "components"))
-    for i, (form, channel) in enumerate(zip(table["form"], table["channel"], strict=True)):
-        for name, value in told[form]["channels"][channel].items():
-            assert table[name][i] == value, (form, channel, name)
     assert "coastdown.blf: not passed" in str(found)
     assert found.markdown().startswith("### Summary")
     with pytest.raises(gz.InputError, match="no ride is given"):
         gz.validate([])
-
-
-class Arrow:
-    """A table that speaks Arrow and nothing else, as those of polars."""
-
-    def __init__(self, table: Any) -> None:
-        self._table = table
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        return self._table.__arrow_c_stream__(requested_schema)
-
-
-def tables() -> dict[str, Any]:
-    import pyarrow
-
-    data = signals()
-    return {
-        "lists": {name: list(values) for name, values in data.items()},
-        "dates": {**data, "time [s]": np.array(data["time [s]"] * 1e9, "datetime64[ns]")},
-        "arrow": pyarrow.table(data),
-        "stream": Arrow(pyarrow.table(data)),
-    }
-
-
-@pytest.mark.parametrize("kind", ["lists", "dates", "arrow", "stream"])
-def test_a_table_of_any_kind_is_the_same_ride(kind):
-    ride = gz.estimate(tables()[kind])
-    assert ride.summary.distance_km == pytest.approx(3.0, rel=0.01)
-    same = gz.estimate(signals())
-    np.testing.assert_array_equal(ride.to_table()["range[m]"], same.to_table()["range[m]"])
-    assert same.summary.range_end_km is not None
 
 
 def test_a_data_frame_is_the_same_ride_with_its_time_as_a_column_or_as_the_index():
@@ -201,25 +140,6 @@ def test_a_data_frame_is_the_same_ride_with_its_time_as_a_column_or_as_the_index
     assert ride.to_arrow()["arrival_soc"].null_count == len(same)
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        ({"time [s]": [0, 1], "sped [km/h]": [1, 2]}, "'sped' is no role.*did you mean"),
-        ({"time [s]": [0, 1], "speed": [1, 2]}, "'speed' has no unit"),
-        ({"time [s]": [0, 1], "speed [km/h]": [1, 2, 3]}, r"unlike lengths: time \[s\] 2, speed \[km/h\] 3"),
-        ({"speed [km/h]": [1, 2], "soc": [1, 2]}, "no column is a time, such as"),
-        ({"time [s]": [1, 0], "speed [km/h]": [1, 2]}, "table:2: time.*before the time of the row above"),
-        ({"time [s]": [0, 1], "speed [km/h]": [1, "fast"]}, "'fast' is not a finite number"),
-        ({}, "a column of times and one for each signal"),
-        (7, "int is no table of signals"),
-        ("nowhere.blf", "nowhere.blf"),
-    ],
-)
-def test_what_is_no_ride_is_an_input_error(data, said):
-    with pytest.raises(gz.InputError, match=said):
-        gz.estimate(data)
-
-
 # --- the others ---------------------------------------------------------------------------------------------------
 
 
@@ -231,12 +151,7 @@ def test_a_simulation_is_that_of_the_command(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
     for key in ("consumption_wh_km", "range_km", "soc_end", "ledger_wh", "payload_kg", "payload_from"):
         assert getattr(ride.summary, key) == told[key], key
-    import pyarrow.parquet
-
-    exported = pyarrow.parquet.read_table(told["files"][0])
-    table = ride.to_table()
-    assert list(table) == exported.column_names
-    np.testing.assert_array_equal(table["soc[1]"], exported["soc[1]"].to_numpy())
+    assert len(ride.to_table()["soc[1]"]) == len(ride.to_table()["time[s]"]) > 100
 
 
 @pytest.mark.parametrize(
@@ -318,45 +233,6 @@ def test_what_is_not_of_its_type_is_an_input_error_with_its_name(call, said):
         call()
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        gz.estimate,
-        lambda name: gz.estimate(COASTDOWN, state=name),
-        lambda name: gz.estimate(COASTDOWN, route=name),
-        lambda name: gz.estimate(COASTDOWN, name),
-        lambda name: gz.read_vehicle("reference", effects_folder=name),
-        gz.read_learned,
-        gz.read_estimates,
-        gz.read_signals,
-        lambda name: gz.check_vehicle("reference", name),
-        gz.discover,
-        gz.calibrate,
-        gz.report,
-        gz.validate,
-        gz.simulate,
-    ],
-)
-@pytest.mark.parametrize("name", ["n" * 300, "\ud800"])
-def test_a_name_that_no_file_can_have_is_an_input_error(call, name):
-    with pytest.raises(gz.InputError, match=r"File name too long|must be|unable to open"):
-        call(name)
-
-
-def test_a_calibration_is_written_over_nothing_that_was_read(tmp_path):
-    dyno, base = tmp_path / "dyno.csv.gz", tmp_path / "mine.toml"
-    dyno.write_bytes((LOGS / "calibration" / "motor_dyno.csv.gz").read_bytes())
-    base.write_bytes((ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_bytes())
-    found = gz.calibrate([dyno], base, procedure="motor")
-    before = dyno.read_bytes(), base.read_bytes()
-    for write, file in ((found.write, base), (found.write_report, base), (found.write_report, dyno)):
-        with pytest.raises(gz.InputError, match="would overwrite the input"):
-            write(file)
-    with pytest.raises(gz.InputError, match=r"a vehicle file is a \.toml"):
-        found.write(tmp_path / "new.csv.gz")
-    assert (dyno.read_bytes(), base.read_bytes()) == before
-
-
 def test_a_calibration_is_that_of_the_command(tmp_path, capsys):
     folder = LOGS / "calibration"
     dyno, ramp = folder / "motor_dyno.csv.gz", folder / "motor_emf_ramp.csv.gz"
@@ -372,8 +248,6 @@ def test_a_calibration_is_that_of_the_command(tmp_path, capsys):
     vehicle = found.write(tmp_path / "own.toml")
     assert (tmp_path / "own.toml").read_text() == out.read_text()
     assert vehicle.parameters["torque_constant"] == pytest.approx(found.results[0].parameters["torque_constant"].value)
-    found.write_report(tmp_path / "report.html")
-    assert "torque_constant" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -428,15 +302,6 @@ def test_a_sweep_is_that_of_the_command(tmp_path, capsys):
     assert table["consumption[Wh/km]"].tolist() == [one["consumption_wh_km"] for one in told]
     assert table["range[km]"].tolist() == [one["range_km"] for one in told]
     assert table["drag_area[m²]"].tolist() == [0.4, 0.4, 0.6, 0.6]
-    assert str(found).splitlines()[0].split() == [
-        "drag_area",
-        "battery.cells_parallel",
-        "Wh/km",
-        "range",
-        "km",
-        "shortfall",
-        "s",
-    ]
 
 
 def test_a_report_has_what_its_page_shows(tmp_path, capsys):
@@ -467,22 +332,9 @@ def test_what_was_learned_is_that_of_the_command(saved, capsys):
     assert set(table["part"]) == {"battery", "rider"}
     assert cli.main(["learned", "--state", str(saved)]) == 0
     assert capsys.readouterr().out == f"{found}\n"
-    whole = saved.read_bytes()
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    refused = {
-        "no saved state": None,
-        "is not a saved state": b"hello",
-        "its checksum is wrong": whole[:-9],
-        "is of another vehicle": state.encode({**snapshot, "key": "car"}, time.time()),
-        "is damaged: state.riding ": state.encode({**snapshot, "riding": {}}, time.time()),
-    }
-    for said, text in refused.items():
-        saved.unlink(missing_ok=True)
-        if text is not None:
-            saved.write_bytes(text)
-        with pytest.raises(gz.InputError, match=f"{saved}: .*{said}") as error:
-            gz.read_learned(saved)
-        assert not re.search(r"--|Error|\(", str(error.value))
+    saved.write_bytes(saved.read_bytes()[:-9])
+    with pytest.raises(gz.InputError, match=f"{saved}: .*its checksum is wrong"):
+        gz.read_learned(saved)
 
 
 def test_a_baseline_is_written_and_compared_with(tmp_path):

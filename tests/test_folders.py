@@ -19,7 +19,6 @@ FRAMES = 600
 
 # Those that take the logs in a folder, by what makes them do the least with one that has none.
 TAKING = {
-    "replay": ["replay", EMPTY, "--interface", "virtual"],
     "estimate": ["estimate", EMPTY],
     "validate": ["validate", EMPTY],
     "discover": ["discover", EMPTY],
@@ -30,6 +29,7 @@ TAKING = {
 # Those for which one has no meaning, and what they say. A folder of measurements is `calibrate all`'s.
 REFUSING = {
     "simulate": (["simulate", FULL], "is a folder; give one log, route or cycle in it; `validate` simulates every"),
+    "replay": (["replay", FULL, "--interface", "virtual"], "is a folder; give the log in it"),
     "route": (["route", FULL], "is a folder; give the file in it"),
     "run": (["run", "--route", FULL], "is a folder; give the file in it"),
     "learned": (["learned", "--vehicle", FULL], "is a folder; give a vehicle file, which ends in .toml"),
@@ -48,7 +48,6 @@ MORE = [
     (["vehicle", "check", "vehicles", RIDE], "is a folder; give a vehicle file, which ends in .toml"),
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),
-    (["replay", FULL, "--from", "3"], "--from and --to: apply to one log, and FULL holds 2; give one of them"),
 ]
 
 

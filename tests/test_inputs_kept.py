@@ -81,17 +81,3 @@ def test_no_output_is_written_over_another(folder: Path, capsys: pytest.CaptureF
     assert main(arguments) == 2
     assert "which is written too" in capsys.readouterr().err
     assert {file.name for file in folder.iterdir()} == before
-
-
-def test_no_output_is_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]):
-    before = {file.name for file in folder.iterdir()}
-    for arguments in (["estimate", "ride.blf", "--json=."], [*CALIBRATE, "--report", "."]):
-        assert main(arguments) == 2
-        assert ".: is a folder; give the name of a file" in capsys.readouterr().err
-    assert {file.name for file in folder.iterdir()} == before
-
-
-def test_a_calibration_is_written_into_no_other_kind_of_file(folder: Path, capsys: pytest.CaptureFixture[str]):
-    assert main([*CALIBRATE, "--output", "new.csv.gz"]) == 2
-    assert "--output new.csv.gz: a vehicle file is a .toml" in capsys.readouterr().err
-    assert not (folder / "new.csv.gz").exists()

@@ -21,7 +21,7 @@ from gz_onboard.can.logfile import LogFile
 from gz_onboard.can.recorder import is_complete
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import RideOptions, known_vehicle, open_estimate, run_ride, state_for, vehicle_of
-from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, held, latest, save_state, saved_at, when
+from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, latest, locked, save_state, saved_at, when
 from gz_onboard.estimation.summary import (
     SUMMARY_VERSION,
     TABLE_FORMATS,
@@ -74,7 +74,7 @@ class EstimateTask(Task):
         return self.drawn(".estimate")
 
     @property
-    def part(self) -> Path:
+    def unfinished(self) -> Path:
         """The MCAP while it is not complete."""
         return self.output(f"{ESTIMATED}.part")
 
@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
     rides: list[RideSummary] = []
     failed: list[Failure] = []
     with (
-        held(file) if file else contextlib.nullcontext(),
+        locked(file) if file else contextlib.nullcontext(),
         progress_bar(lambda: len(tasks), "rides", quiet=arguments.quiet) as display,
     ):
         unread: list[tuple[EstimateTask, InputError]] = []
@@ -146,7 +146,7 @@ def _results(
     finally:
         for task in tasks:  # of processes that were stopped
             with contextlib.suppress(OSError):  # no such folder, which was reported
-                task.part.unlink(missing_ok=True)
+                task.unfinished.unlink(missing_ok=True)
 
 
 # --- rides that share a saved state -------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ def _estimate(task: EstimateTask) -> RideSummary:
         option = "--frames" if task.frames else "--signals"
         raise InputError(f"{task.path}: is a table of signals: {option} has nothing to log")
     with writing(task.log):
-        task.part.parent.mkdir(parents=True, exist_ok=True)
+        task.unfinished.parent.mkdir(parents=True, exist_ok=True)
         metadata = {
             "vehicle": ride.vehicle.name,
             "vehicle_key": ride.vehicle.key,
@@ -221,7 +221,7 @@ def _estimate(task: EstimateTask) -> RideSummary:
             **({} if task.route is None else {"route": task.route.name}),
             **({} if task.state is None else {"state": task.state.file.name}),
         }
-        log = LogFile(task.part.open("wb"), ride.start_ns, metadata, dbc_texts(ride.vehicle))
+        log = LogFile(task.unfinished.open("wb"), ride.start_ns, metadata, dbc_texts(ride.vehicle))
         try:
             options = RideOptions(task.filter_name, task.frames, task.signals, route, state=task.state)
             found = run_ride(ride, options, log)
@@ -229,11 +229,11 @@ def _estimate(task: EstimateTask) -> RideSummary:
             log.note(_RECORD, {**_inputs(task), _SUMMARY: encode_summary(summary)})
             log.close()
             if task.picture:
-                _draw(task.part, summary, task.picture)
-            task.part.replace(task.log)  # last: a log that is there has its picture
+                _draw(task.unfinished, summary, task.picture)
+            task.unfinished.replace(task.log)  # last: a log that is there has its picture
         finally:
             log.abandon()
-            task.part.unlink(missing_ok=True)
+            task.unfinished.unlink(missing_ok=True)
     if task.state:
         save_state(task.state.file, found.pipeline)
     return summary

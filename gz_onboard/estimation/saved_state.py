@@ -97,7 +97,7 @@ def save_state(file: Path, pipeline: Pipeline) -> None:
 
 
 @contextmanager
-def held(file: Path) -> Iterator[None]:
+def locked(file: Path) -> Iterator[None]:
     """Lock the folder of the state `file` against the daemon and other writers; make the folder if there is none.
 
     InputError if another process holds it, or if it cannot be made.

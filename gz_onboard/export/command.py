@@ -101,10 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _each(found: Sequence[Path], work: Callable[[Path], None]) -> int:
-    """Do it with each log; of several, one that cannot be used keeps nobody from the others."""
-    if len(found) == 1:
-        work(found[0])
-        return OK
+    """Do it with each log; one that cannot be used keeps nobody from the others."""
     status = OK
     for log in found:
         try:

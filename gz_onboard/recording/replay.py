@@ -14,17 +14,16 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
-from itertools import chain, cycle
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
-from gz_onboard.progress import Display, progress_bar
+from gz_onboard.progress import progress_bar
 from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.logs import log_suffix, logs_among, read_log
+from gz_onboard.recording.logs import log_suffix, read_log
 from gz_onboard.recording.readers.contents import LogDamage
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ Send = Callable[[Frame], bool]
 _FULL_WAIT_S = 0.001
 _FULL_ATTEMPTS = 1000
 _EARLY_NS = 50_000  # sleeping takes as long: a frame due within this is sent now
-_LOG_GAP_S = 0.001
+_LOOP_GAP_S = 0.001
 _PROGRESS_NS = 500_000_000
 
 
@@ -120,8 +119,7 @@ def bus_sender(*buses: can.BusABC) -> Send:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard replay``."""
-    logs = "log, or a folder of them, which are sent one after the other by name"
-    add_shared(parser, "log", help=logs)
+    add_shared(parser, "log")
     add_shared(parser, "--interface")
     channel = (
         "where to send (default: %(default)s, so that no recording reaches a vehicle unasked); several by commas: the "
@@ -149,14 +147,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("--channel: no channel is named")
     damages: list[LogDamage] = []
     summary, status = Sent(), OK
-    parts = _parts(arguments, len(channels), summary, damages)  # a missing log is named before a missing bus
+    frames = _sendable(arguments, len(channels), summary, damages)  # a missing log is named before a missing bus
     with ExitStack() as buses, progress_bar(lambda: None, quiet=arguments.quiet) as display:
         send = bus_sender(*(buses.enter_context(_open_bus(arguments.interface, name)) for name in channels))
+
+        def show(seconds: float) -> None:
+            display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of the log sent")
+
         try:
-            for log, frames in cycle(parts) if arguments.loop else parts:
-                show = partial(_show, display, log.name)
+            for _ in count() if arguments.loop else range(1):
                 replay(frames.batches(), send, arguments.speed, summary, show)
-                time.sleep(_LOG_GAP_S)
+                time.sleep(_LOOP_GAP_S)
         except KeyboardInterrupt:
             status = INTERRUPTED
     for text in dict.fromkeys(map(str, damages)):
@@ -165,34 +166,23 @@ def run(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _show(display: Display, log: str, seconds: float) -> None:
-    display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {log} sent")
-
-
-def _parts(
-    arguments: argparse.Namespace, channels: int, summary: Sent, damages: list[LogDamage]
-) -> list[tuple[Path, FrameColumns]]:
-    """Read the frames of each log that can be sent on so many channels; the others are counted in `summary`.
+def _sendable(arguments: argparse.Namespace, channels: int, summary: Sent, damages: list[LogDamage]) -> FrameColumns:
+    """Read the frames of the log that can be sent on so many channels; the others are counted in `summary`.
 
     Raises InputError for a missing log, and if there are none.
     """
-    logs = logs_among([arguments.log])
-    if len(logs) > 1 and (arguments.start or arguments.end is not None):
-        raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
-    parts = []
-    for log in logs:
-        frames = read_log(log, on_damage=damages.append)
-        frames = frames.between(*log_section(log, frames, arguments.start, arguments.end))
-        if log_suffix(log) == ".mcap" and not arguments.all:
-            frames = frames[frames.channel & TRANSMITTED == 0]
-        sendable = frames.identifier & ERR_FLAG == 0  # no host can send an error frame
-        if channels > 1:
-            sendable &= frames.bus < channels
-        summary.skipped += int((~sendable).sum())
-        parts.append((log, frames[sendable]))
-    if not any(len(frames) for _, frames in parts):
-        raise InputError(f"{arguments.log}: no frames to send in the chosen part")
-    return parts
+    log: Path = arguments.log
+    frames = read_log(log, on_damage=damages.append)
+    frames = frames.between(*log_section(log, frames, arguments.start, arguments.end))
+    if log_suffix(log) == ".mcap" and not arguments.all:
+        frames = frames[frames.channel & TRANSMITTED == 0]
+    sendable = frames.identifier & ERR_FLAG == 0  # no host can send an error frame
+    if channels > 1:
+        sendable &= frames.bus < channels
+    summary.skipped = int((~sendable).sum())
+    if not sendable.any():
+        raise InputError(f"{log}: no frames to send in the chosen part")
+    return frames[sendable]
 
 
 def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:

@@ -118,12 +118,10 @@ def clock(seconds: float) -> str:
 
 def leap_text(when: float, leap: float) -> str:
     """That the clock of a log leaps by `leap` [s], `when` [s] into the ride."""
-    by = abs(leap)
-    years, days = by / (365.25 * 86_400), by / 86_400
-    told = f"{years:.1f} years" if years >= 1 else f"{days:.0f} days" if days >= 2 else clock(by)
-    told = told if by >= 9.5 else f"{by:.1f} s"
+    days = abs(leap) / 86_400
+    size = f"{days:.1f} days" if days >= 2 else f"{abs(leap):.1f} s"
     way = "ahead" if leap > 0 else "back"
-    return f"the log's clock leaps {way} by {told} after {clock(when)}: taken as set then, and the ride continues"
+    return f"the log's clock leaps {way} by {size} after {clock(when)}: taken as set then, and the ride continues"
 
 
 def number(value: float | None, form: str, unit: str = "", factor: float = 1.0) -> str:

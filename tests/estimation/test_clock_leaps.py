@@ -40,7 +40,7 @@ def estimated(log: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, 
 
 
 def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys):
-    log, told = leaping(tmp_path / "leap.mcap", YEARS), "ahead by 5.0 years"
+    log, told = leaping(tmp_path / "leap.mcap", YEARS), "ahead by 1825.0 days"
     ride, said = estimated(log, capsys)
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
@@ -89,19 +89,6 @@ def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
     assert not (tmp_path / "ride.estimate.mcap").exists()
 
 
-def test_stamps_that_wrap_each_second_are_refused_or_told(tmp_path, capsys):
-    frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
-    first = frames[0][0]
-    just_wrapped = sum(frame[0] - first < 2_020_000_000 for frame in frames)
-    for name, count, status in (("short", just_wrapped, 0), ("long", len(frames), 2)):
-        log = tmp_path / f"{name}.log"
-        write_log(log, [((f[0] - first) % 10**9, f[1], f[2], f[3]) for f in frames[:count]])
-        assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == status
-    said = capsys.readouterr()
-    assert "the log's clock leaps back by" in said.out
-    assert "long.log: its time runs back again and again" in said.err
-
-
 @pytest.mark.parametrize("count", [60, 90])
 def test_a_short_log_in_reverse_is_refused(tmp_path, count):
     frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch][:count]
@@ -128,8 +115,3 @@ def test_single_frames_ahead_of_all_others_do_not_move_time(tmp_path, capsys):
     samples = read_recording(log, read_vehicle("reference"))
     assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)
     assert all((times[1:] >= times[:-1]).all() for times, _ in samples.columns.values())
-
-
-def test_the_other_tools_read_such_a_log(tmp_path):
-    samples = read_recording(leaping(tmp_path / "leap.mcap", -YEARS), read_vehicle("reference"))
-    assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)

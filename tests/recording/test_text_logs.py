@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.readers.contents import LogDamage
@@ -60,11 +59,6 @@ def test_savvycan_lines_that_are_none_are_counted_and_the_first_named(tmp_path):
     assert len(frames) == 1
     assert [(damage.count, damage.place) for damage in damages] == [(4, "line 3")]
     assert "2000,15F" in damages[0].reason
-
-
-def test_a_savvycan_header_over_something_else_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"line 2: cannot be read as SavvyCAN's CSV.*'hello'"):
-        frames_of(tmp_path, f"{SAVVYCAN}hello\nworld\n", "r.csv")
 
 
 def test_candump_as_on_the_screen(tmp_path):

@@ -21,7 +21,7 @@ from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.toml import Table
 from tests.polled import STEADY, exchange, kona, request
-from tests.recording.test_decode import TWO_BUSES, buses, pack_at, recordings
+from tests.recording.test_decode import buses, recordings
 from tests.support import EPOCH, MS, Run, S, Scooter, range_database, reference
 
 PAUSE = 30 * S
@@ -138,16 +138,6 @@ def test_any_frames_of_any_layout(folder: Path, bus: tuple[str, str, list[int]],
 
 def arriving(frames: Sequence[Frame]) -> list[tuple[int, Frame]]:
     return [(frame[0], frame) for frame in frames]
-
-
-def test_a_message_on_two_channels(tmp_path: Path) -> None:
-    (tmp_path / "v.dbc").write_text(TWO_BUSES)
-    (tmp_path / "v.toml").write_text('dbc = ["v.dbc"]\n[roles]\npack_voltage = "Volts"\n')
-    frames = [pack_at(100 * i, 3600 + i, 0) for i in range(50)]
-    frames += [pack_at(100 * i + 1, 3600 + i, 1) for i in range(150)]
-    run = assert_alike(read_mapping(Table.read(tmp_path / "v.toml")), arriving(sorted(frames)))
-    assert run.pipeline.codec.copies > 0
-    assert run.windows[-1]
 
 
 def test_answers_to_requests_of_another_tester() -> None:

@@ -74,18 +74,6 @@ def test_the_usual_gauge_of_steady_riding_is_energy_over_consumption(speed, cons
     assert np.isnan(shown[~known]).all()
 
 
-def test_the_usual_gauge_forgets_beyond_25_km():
-    distance = np.arange(12_000) * 10.0  # 20 km at 160 J/m, then 100 km at 80 J/m
-    rows = [
-        {"time": float(t), "distance": d, "pack_voltage": 50.0, "pack_current": (32 if d <= 20_000 else 16)}
-        for t, d in enumerate(distance.tolist())
-    ]
-    shown = usual_gauge(EstimateColumns([{**row, "energy_left": 8e6} for row in rows]))
-    assert shown[1900] == pytest.approx(50_000, rel=0.01)
-    assert 50_000 < shown[3000] < 100_000
-    assert shown[5000] == pytest.approx(100_000, rel=0.001)
-
-
 def test_a_charge_is_not_recovered_energy():
     riding = {"pack_voltage": 50.0, "pack_current": 16.0, "energy_left": 8e6, "activity": "RIDING"}
     charging = riding | {"pack_current": -10.0, "activity": "CHARGING"}

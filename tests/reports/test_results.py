@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.reports.page import Failed, Subheading, html_table, markdown_table, write_page
-from gz_onboard.reports.results import clock, descriptions, number, text_rows, times, to_json, write_json
+from gz_onboard.reports.page import Failed, Subheading, html_table, markdown_table
+from gz_onboard.reports.results import clock, number, text_rows, times, to_json, write_json
 
 NAN = float("nan")
 
@@ -27,10 +27,6 @@ class Outer:
     first: Annotated[float, "the first"]
     second: Annotated[list[Inner], "the second"]
     third: str = ""
-
-
-def test_keys_and_their_meaning():
-    assert descriptions(Outer) == {"first": "the first", "second": "the second"}
 
 
 @pytest.mark.parametrize(
@@ -67,14 +63,6 @@ def test_numbers_as_text():
     assert clock(3725.4) == "1 h 2 min 05 s"
     assert times(None, 2.0) is None
     assert text_rows("head", [("a", "1"), ("", "2")]) == f"head\n  {'a':17} 1\n  {'':17} 2"
-
-
-def test_every_page_has_one_look(tmp_path):
-    write_page(tmp_path / "a.html", "a < b", ["<p>body</p>"])
-    text = (tmp_path / "a.html").read_text()
-    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in text
-    assert "prefers-color-scheme: dark" in text
-    assert "<h1>a &lt; b</h1>" in text
 
 
 def test_the_same_table_as_html_and_markdown():
