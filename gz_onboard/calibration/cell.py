@@ -227,7 +227,7 @@ def open_circuit(table: Measurements, cutoff: float = 0.0) -> Result:
     value, sd = _ends(sweep, *_between(sweep, half, result), result)
     value = _monotonic(value, result, test.name)
     sd_tester = TESTER * sweep.capacity
-    if sweep.own or sweep.charged > (1 - c.unexplained) * sweep.capacity:
+    if sweep.charged > (1 - c.unexplained) * sweep.capacity:
         sd_tester = float(np.hypot(sd_tester, sweep.capacity - sweep.charged))
     source = (
         f"{test.name}: discharge at {sweep.current:.3f} A in {sweep.hours:.1f} h at "
@@ -259,8 +259,7 @@ class OcvSweep:
     """A slow discharge and the charge that belongs to it; `down` and `up` are their samples, `up` may be empty.
 
     before, last: rows before the discharge and at its end. rested: before the discharge. charged [A·h]: brought back.
-    resistance [ohm]: within minutes of switching the current. own: the charge's SOC is by its own charge, since that
-    of the discharge does not agree.
+    resistance [ohm]: within minutes of switching the current.
     """
 
     test: CellTest
@@ -274,7 +273,6 @@ class OcvSweep:
     capacity: float  # A·h
     charged: float
     resistance: float
-    own: bool = False
 
     @property
     def resistive(self) -> float:
@@ -291,11 +289,7 @@ class OcvSweep:
     def level(self) -> Array:
         """State of charge of each sample, 1 before the discharge."""
         drawn = self.test.drawn
-        level: Array = 1 - (drawn - drawn[self.before]) / self.capacity
-        if self.own:
-            up = drawn[self.up]
-            level[self.up] = 1 - (up - up[-1]) / self.charged
-        return level
+        return np.asarray(1 - (drawn - drawn[self.before]) / self.capacity)
 
 
 def _find_sweep(test: CellTest, result: Result) -> OcvSweep:
@@ -338,7 +332,7 @@ def _find_sweep(test: CellTest, result: Result) -> OcvSweep:
 
 
 def _paired(sweep: OcvSweep, result: Result) -> OcvSweep:
-    """`sweep` without a charge that is no counterpart of its discharge, or with that by its own charge."""
+    """`sweep`, without a charge that is no counterpart of its discharge."""
     test, c = sweep.test, SLOW_TEST
     if not np.any(sweep.up):
         return sweep
@@ -349,23 +343,13 @@ def _paired(sweep: OcvSweep, result: Result) -> OcvSweep:
         why = f"the charge at {current:.3g} A is no counterpart of the discharge at {sweep.current:.3g} A"
     elif abs(share - 1) <= c.unexplained or (share < 1 and reached <= sweep.full - c.full_within):
         return sweep
-    elif abs(share - 1) <= c.most_apart:
-        result.refusals.append(
-            f"{test.name}: {counts}: they differ by {100 * abs(share - 1):.1f} %, of which coulombic efficiency and "
-            f"tester explain {100 * c.unexplained:.0f} % at most. The capacity is what was discharged, its sd holds "
-            "the difference; each branch's state of charge is by its own charge"
-        )
-        return replace(sweep, own=True)
-    elif share > 1:
+    elif share > 1 + c.most_apart:
         raise test.table.error(
             f"{counts}, over {100 * c.most_apart:.0f} % more: the discharge did not begin full or end empty, or a "
             "current is wrong"
         )
     else:
-        why = (
-            f"the charge reaches {reached:.3f} V, as full as the discharge began ({sweep.full:.3f} V), after "
-            f"{sweep.charged:.3f} of {sweep.capacity:.3f} A·h: the branches do not close, their mean would be wrong"
-        )
+        why = f"{counts}, and reaches {reached:.3f} V of {sweep.full:.3f} V: the branches do not close"
     result.refusals.append(f"{test.name}: {why}. The discharge alone is used, moved by its resistance")
     return replace(sweep, up=np.zeros(len(test), dtype=bool), charged=0.0)
 

@@ -1,7 +1,7 @@
 """Motor and inverter from steady points of a dynamometer (Lord 2016, eqs. 2.7, 2.8, sec. 2.3, figs. 2.12 to 2.15).
 
 Back-EMF over speed, torque over current, and losses in watts: an efficiency has no value at no torque, where a scooter
-in traffic spends its time; it is derived, to be plotted. The shaft gives what the air gap does less the drag of iron
+in traffic spends its time. The shaft gives what the air gap does less the drag of iron
 and bearings, so that shaft torque is no line through zero:
 
     torque = torque_constant·i_m − motor_iron_linear·sign(ω) − motor_iron_quadratic·ω
@@ -282,16 +282,12 @@ def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) ->
         source = f"copper, {COPPER.source}"
         result.parameters[COPPER.name] = Found(COPPER.prior, COPPER.prior_sd, COPPER.unit, source)
     result.panels += compared("Motor loss", CURRENT, "loss [W]", bench.current, bench.loss, model, "x")
-    power = bench.torque * bench.speed
-    result.panels.append(
-        _efficiency("Motor efficiency (derived)", "torque [N·m]", bench.torque, power, bench.loss, model)
-    )
     return result
 
 
 def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
     """inverter_loss_constant [W], _linear [W/A], _quadratic [W/A²] of steady points: DC less AC power."""
-    current, power, loss = dyno["motor_current"], dyno["ac_power"], dyno["dc_power"] - dyno["ac_power"]
+    current, loss = dyno["motor_current"], dyno["dc_power"] - dyno["ac_power"]
     _check_loss(dyno, loss, "dc_power is below ac_power", "an inverter")
     use: Mask = np.abs(current) <= largest_current
     if use.sum() < 9 or np.ptp(np.abs(current[use])) < 0.3 * largest_current:
@@ -312,7 +308,6 @@ def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT)
         result.parameters[parameter] = found.found(parameter, UNITS[parameter], source)
     result.covariance.append((found.names, found.covariance))
     result.panels += compared("Inverter loss", CURRENT, "loss [W]", current, loss, model, "x")
-    result.panels.append(_efficiency("Inverter efficiency (derived)", "AC power [W]", power, power, loss, model))
     return result
 
 
@@ -330,16 +325,3 @@ def _inverter(current: Array, loss: Array, power: Array) -> Solution:
         variance = np.maximum(squares["constant"], 0) + max(squares["size"], 0.0) * size**2
         found = linear(columns, loss, np.sqrt(np.maximum(variance, 0.1 * np.mean(variance) + 1e-12)))
     return found
-
-
-def _efficiency(title: str, x_label: str, x: Array, power: Array, loss: Array, model: Array) -> Panel:
-    """Efficiency [%] of giving `power` [W] forward, or of taking it back where it is negative; none near no power."""
-
-    def ratio(lost: Array) -> Array:
-        forward = power / np.where(power + lost > 0, power + lost, np.nan)
-        back = (power + lost) / np.where(power < 0, power, np.nan)
-        value: Array = 100 * np.where(power > 0, forward, np.maximum(back, 0.0))
-        return np.where(np.abs(power) > 0.02 * np.max(np.abs(power)), value, np.nan)
-
-    lines = PlotLine("measured", x, ratio(loss), "."), PlotLine("model", x, ratio(model), "x")
-    return Panel(title, x_label, "efficiency [%]", lines)

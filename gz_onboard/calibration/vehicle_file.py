@@ -78,7 +78,6 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     document = tomlkit.parse(text)
     parameters = {name: found for result in results for name, found in result.parameters.items()}
     curves = {name: curve for result in results for name, curve in result.curves.items()}
-    _check(parameters, curves, base)
     order = list(declared_parameters())
     groups = _correlations(document.get("correlation", {}), results, set(parameters), base)
     for name in [name for name in document.get("correlation", {}) if name not in groups]:
@@ -207,28 +206,6 @@ def _unmeasured(curve: Curve) -> str:
         if spans:
             parts.append(f"{inner} {', '.join(spans)}" + "".join(f" at {name} {at[i]:g}" for name, at in outer))
     return "; ".join(parts)
-
-
-def _check(parameters: Mapping[str, Found], curves: Mapping[str, Curve], base: Path) -> None:
-    """InputError, naming the data, for values that the reader of vehicle files would refuse."""
-    declared = declared_parameters()
-    for name, found in parameters.items():
-        if (known := declared.get(name)) is None:
-            continue  # of a user's own effect; reading the file checks it
-        value = _rounded(found.value)
-        if found.unit != known.unit:
-            raise InputError(f"{base}: {name}: was found in {found.unit}, but is in {known.unit}")
-        if not known.low <= value <= known.high:
-            raise InputError(
-                f"{base}: {name}: {value:g} {known.unit} was found, outside {known.low:g} to {known.high:g}"
-                f" {known.unit}; {found.source}"
-            )
-        if not (np.isfinite(found.sd) and found.sd >= 0):
-            raise InputError(f"{base}: {name}: its standard deviation came out as {found.sd:g} {known.unit}")
-    for name, curve in curves.items():
-        shape = tuple(len(axis) for axis in reversed(curve.axes.values()))
-        if curve.value.shape != shape or not np.all(np.isfinite(curve.value)):
-            raise InputError(f"{base}: {name}: must be {shape} finite numbers, is {curve.value.shape}")
 
 
 def _effects(document: TOMLDocument, results: Sequence[Result]) -> dict[tuple[str, ...], object]:

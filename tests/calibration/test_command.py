@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import shutil
@@ -65,24 +64,6 @@ def test_all_of_a_folder_uses_what_came_before(tmp_path, capsys):
     assert out.read_text() == before
 
 
-def test_columns_of_other_people(tmp_path, capsys):
-    rows = (DATA / "motor_emf_ramp.csv.gz", DATA / "motor_dyno.csv.gz")
-    shutil.copy(rows[1], tmp_path)
-    text = (
-        gzip.decompress(rows[0].read_bytes()).decode().replace("motor_speed_radps", "n").replace("emf_line_Vrms", "U")
-    )
-    (tmp_path / "ramp.csv").write_text(text)
-    table = {"emf": "ramp.csv", "data": "motor_dyno.csv.gz"}
-    lines = "".join(f'{slot} = "{name}"\n' for slot, name in table.items())
-    columns = (
-        'emf_columns = { motor_speed = { column = "n", unit = "radps" }, emf_line = { column = "U", unit = "V" } }\n'
-    )
-    (tmp_path / "calibration.toml").write_text(f"schema = 1\n[motor]\n{lines}{columns}")
-    assert main(["calibrate", "all", str(tmp_path), "--json", "-"]) == 0
-    found = json.loads(capsys.readouterr().out)["procedures"][0]["parameters"]["voltage_constant"]
-    assert found["value"] == pytest.approx(0.5309, abs=0.002)
-
-
 def test_a_folder_of_rides_is_its_logs(tmp_path, capsys):
     for name in ("coastdown_01.blf", "coastdown_02.blf", "rides.json", "motor_emf_ramp.csv.gz"):
         shutil.copy(DATA / name, tmp_path)
@@ -123,13 +104,6 @@ def test_wrong_use_is_named(arguments, message, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert re.search(message, error)
     assert error.count("\n") == 1
-
-
-def test_nothing_is_written_when_something_is_wrong(tmp_path, monkeypatch):
-    monkeypatch.chdir(DATA)
-    out = tmp_path / "x.toml"
-    assert main(["calibrate", "ocv", "motor_dyno.csv.gz", "--output", str(out)]) == 2
-    assert not any(tmp_path.iterdir())
 
 
 def test_help_names_every_procedure(capsys):

@@ -18,20 +18,22 @@ def ramp(seed, noise=0.04, constant=0.53):
     return table(motor_speed=speed, emf_line=constant * speed + noise * np.random.default_rng(seed).normal(size=70))
 
 
-def test_voltage_constant_comes_back_within_its_own_interval():
-    held = 0
+@pytest.mark.parametrize(
+    ("procedure", "data", "truth"),
+    [
+        (voltage_constant, ramp, {"voltage_constant": 0.53}),
+        (torque_constant, dyno, {"torque_constant": MOTOR["torque_constant"]}),
+        (motor_losses, dyno, {name: MOTOR[name] for name in MOTOR if name != "torque_constant"}),
+        (inverter_losses, dyno, INVERTER),
+    ],
+)
+def test_parameters_come_back_within_their_own_intervals(procedure, data, truth):
+    held = dict.fromkeys(truth, 0)
     for seed in range(SEEDS):
-        found = voltage_constant(ramp(seed)).parameters["voltage_constant"]
-        held += abs(found.value - 0.53) < 1.96 * found.sd
-    assert 0.90 <= held / SEEDS <= 0.99
-
-
-def test_torque_constant_comes_back_within_its_own_interval():
-    held = 0
-    for seed in range(SEEDS):
-        found = torque_constant(dyno(seed)).parameters["torque_constant"]
-        held += abs(found.value - MOTOR["torque_constant"]) < 1.96 * found.sd
-    assert 0.90 <= held / SEEDS <= 0.99
+        found = procedure(data(seed)).parameters
+        for name, value in truth.items():
+            held[name] += abs(found[name].value - value) < 1.96 * found[name].sd
+    assert all(0.90 <= count / SEEDS <= 0.99 for count in held.values()), held
 
 
 def test_saturation_is_told_and_held_by_the_sd():
@@ -42,11 +44,6 @@ def test_saturation_is_told_and_held_by_the_sd():
     beyond = [fit for fit in bent.fits if fit.held_out and "all currents" in fit.data]
     within = [fit for fit in bent.fits if fit.held_out and "up to" in fit.data]
     assert beyond[0].rms > 2 * within[0].rms  # the range stated is the range that holds
-
-
-def test_what_is_held_out_is_not_in_the_fit():
-    run = dyno(0, noise=0.0)
-    assert all(fit.rms < 1e-6 for fit in torque_constant(run).fits)
 
 
 @pytest.mark.parametrize(
@@ -65,28 +62,17 @@ def test_bad_dynamometer_data_are_refused(spoilt, message):
         torque_constant(spoilt(dyno(0)))
 
 
-def test_bad_ramps_are_refused():
-    with pytest.raises(InputError, match="4 points are too few"):
-        voltage_constant(table(motor_speed=[1, 2, 3, 4], emf_line=[1, 2, 3, 4]))
-    with pytest.raises(InputError, match="too narrow a range"):
-        voltage_constant(table(motor_speed=[30, 31, 32, 33, 34], emf_line=[1, 2, 3, 4, 5]))
-    with pytest.raises(InputError, match="falls where motor_speed rises"):
-        voltage_constant(table(motor_speed=[1, 2, 3, 4, 5], emf_line=[5, 4, 3, 2, 1]))
-
-
-SEEDS = 200
-
-
-@pytest.mark.parametrize(("procedure", "truth"), [(motor_losses, MOTOR), (inverter_losses, INVERTER)])
-def test_losses_come_back_within_their_own_intervals(procedure, truth):
-    names = [name for name in truth if name != "torque_constant"]
-    held = dict.fromkeys(names, 0)
-    for seed in range(SEEDS):
-        result = procedure(dyno(seed))
-        for name in names:
-            found = result.parameters[name]
-            held[name] += abs(found.value - truth[name]) < 1.96 * found.sd
-    assert all(0.90 <= count / SEEDS <= 0.99 for count in held.values()), held
+@pytest.mark.parametrize(
+    ("speed", "emf", "message"),
+    [
+        ([1, 2, 3, 4], [1, 2, 3, 4], "4 points are too few"),
+        ([30, 31, 32, 33, 34], [1, 2, 3, 4, 5], "too narrow a range"),
+        ([1, 2, 3, 4, 5], [5, 4, 3, 2, 1], "falls where motor_speed rises"),
+    ],
+)
+def test_bad_ramps_are_refused(speed, emf, message):
+    with pytest.raises(InputError, match=message):
+        voltage_constant(table(motor_speed=speed, emf_line=emf))
 
 
 def test_without_noise_everything_is_found_exactly():

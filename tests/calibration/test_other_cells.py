@@ -123,55 +123,6 @@ def test_a_step_that_fails_leaves_the_report_of_those_before(tmp_path, capsys):
     assert not out.exists()
 
 
-def counted(share, **plant):
-    """A slow test whose tester counts `share` of the charge that it brings back."""
-    table, cell = slow_test(**plant)
-    table["current"][table["current"] < 0] *= share
-    return table, cell
-
-
-@pytest.mark.parametrize("share", [0.94, 1.068])
-def test_branches_of_different_charge_are_each_by_their_own_and_it_is_said(share):
-    table, cell = counted(share, hysteresis=0.005)
-    result = bench.open_circuit(table)
-    curve, capacity = result.curves["battery.ocv"], result.parameters["cell_capacity"]
-    assert capacity.value == pytest.approx(cell.capacity, rel=1e-3)
-    assert capacity.sd > 0.9 * abs(1 - share) * cell.capacity
-    inside = (bench.OCV_SOC > 0.1) & (bench.OCV_SOC < 1)
-    assert np.abs(curve.value - cell.ocv(bench.OCV_SOC))[inside].max() < 0.004
-    assert f"brings back {share * cell.capacity:.3f} of {cell.capacity:.3f} A·h" in " ".join(result.refusals)
-
-
-def test_a_fast_charge_is_not_averaged_with_a_slow_discharge():
-    cell = Plant()
-    pieces = [(0, 600, 60), (0.125, 72000, 60), (0, 3600, 60), (-1.25, 7200, 60), (0, 600, 60)]
-    result = bench.open_circuit(cell.run(pieces, name="ocv.csv"))
-    assert "1.25 A" in result.refusals[0]
-    middle = (bench.OCV_SOC > 0.1) & (bench.OCV_SOC < 0.9)
-    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(bench.OCV_SOC))[middle].max() < 0.006
-
-
-def test_a_charge_before_the_discharge_is_a_branch_too():
-    cell = Plant(soc=0.0, hysteresis=0.005)
-    pieces = [(0, 600, 60), (-0.125, 72000, 60), (0, 3600, 60), (0.125, 72000, 60), (0, 3600, 60)]
-    result = bench.open_circuit(cell.run(pieces, name="ocv.csv"))
-    inside = (bench.OCV_SOC > 0.05) & (bench.OCV_SOC < 1)
-    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(bench.OCV_SOC))[inside].max() < 0.003
-    assert not result.refusals
-
-
-@pytest.mark.parametrize("before", [[], [(-0.125, 3600, 60)], [(-1.25, 360, 60), (0, 120, 60)]])
-def test_without_a_rest_before_the_discharge_full_is_not_its_first_voltage(before):
-    cell = Plant(soc=1.0 - sum(-current * seconds for current, seconds, _ in before) / 3600 / 2.5)
-    table = cell.run([*before, (0.125, 72000, 60), (0, 3600, 60), (-0.125, 72000, 60), (0, 600, 60)], name="ocv.csv")
-    if not before:
-        table = replace(table, columns={name: column[2:] for name, column in table.columns.items()})
-    result = bench.open_circuit(table)
-    curve = result.curves["battery.ocv"]
-    assert re.search(r"ocv.csv: no rest before the discharge .* moved by", result.refusals[-1])
-    assert abs(curve.value[-1] - cell.ocv(1.0)) < min(curve.sd[-1], 0.012)
-
-
 @cache
 def slow():
     result = bench.open_circuit(slow_test()[0])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import html
 import json
-from html.parser import HTMLParser
+import re
 
 import numpy as np
 import pytest
 
-from gz_onboard.calibration.report import VERSION, document, picture, plus_minus, text, write_report
+from gz_onboard.calibration.report import VERSION, document, plus_minus, text, write_report
 from gz_onboard.calibration.result import Curve, Fit, Found, Panel, PlotLine, Result
 from gz_onboard.reports.results import write_json
 
@@ -29,37 +30,17 @@ def a_result() -> Result:
     )
 
 
-class Page(HTMLParser):
-    """Collects what a page refers to and says."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.references: list[str] = []
-        self.words: list[str] = []
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.references += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-
 def test_the_page_needs_nothing_else_and_says_all(tmp_path):
-    file = tmp_path / "r.html"
-    write_report(file, "A & B", [a_result()])
-    page = Page()
-    page.feed(file.read_text())
-    assert all(reference.startswith(("#", "data:image")) for reference in page.references)
-    words = " ".join(page.words)
+    pages = [tmp_path / "r.html", tmp_path / "s.html"]
+    for file in pages:
+        write_report(file, "A & B", [a_result()])
+    page = pages[0].read_text()
+    assert all(link.startswith(("#", "data:image")) for link in re.findall(r'(?:src|href)="([^"]*)"', page))
+    words = html.unescape(re.sub(r"<[^>]+>", " ", page))
     for said in ("A & B", "0.500 ± 0.030", "runs <1> & 2", "two runs (held out)", "0.9900", "+0.50", "± 3 %", "a note"):
         assert said in words
-    assert {"img", "meta"} <= set(page.tags)
-    assert file.stat().st_size < 100_000
-    again = tmp_path / "s.html"
-    write_report(again, "A & B", [a_result()])
-    assert again.read_bytes() == file.read_bytes()
+    assert "<img" in page and len(page) < 100_000
+    assert page == pages[1].read_text()
 
 
 def test_json_holds_no_nan(capsys):
@@ -96,7 +77,3 @@ def test_text():
 )
 def test_as_many_digits_as_are_known(value, sd, expected):
     assert plus_minus(value, sd) == expected
-
-
-def test_a_picture_of_one_panel():
-    assert 1_000 < len(picture(a_result().panels[0])) < 20_000

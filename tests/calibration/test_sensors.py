@@ -34,7 +34,6 @@ from .rides import (
     SERIES,
     UNLIT,
     VEHICLE,
-    VOLTAGE_NOISE,
     VOLTS_APART,
     gps_ride,
     ride,
@@ -46,16 +45,6 @@ from .rides import (
 def test_a_planted_radius_comes_back(radius, seed, lag):
     found = wheel_radius([gps_ride(radius, seed, lag, top=14.0), gps_ride(radius, seed + 1, lag, top=14.0)], VEHICLE)
     assert found.parameters["wheel_radius"].value == pytest.approx(radius, rel=0.002)
-
-
-def test_its_sd_holds_receivers_that_err():
-    inside = 0
-    for seed in range(60):
-        bias = float(np.random.default_rng(seed).normal(0, RIDE.receiver_sd))  # one receiver on all rides
-        rides = [gps_ride(0.24, 10 * seed + k, minutes=3, bias=bias) for k in range(3)]
-        found = wheel_radius(rides, VEHICLE).parameters["wheel_radius"]
-        inside += abs(found.value - 0.24) < 1.96 * found.sd
-    assert 0.9 <= inside / 60 <= 0.99
 
 
 def test_what_does_not_tell_is_refused():
@@ -79,33 +68,6 @@ def test_without_a_motor_speed_it_is_that_of_the_rear_wheel_and_says_so():
     assert result.parameters["wheel_radius"].value == pytest.approx(0.24, rel=0.003)
     assert "car: no motor_speed, taken by wheel_speed_rear instead" in result.notes
     assert "gps_speed over wheel_speed_rear" in result.parameters["wheel_radius"].source
-
-
-def test_intervals_hold_what_instruments_of_their_class_do():
-    """Over scooters whose inverter's current sensor and own loss err as their class and the vehicle file say."""
-    rng, known = np.random.default_rng(0), VEHICLE.parameters
-    own_sd = known.sd("inverter_loss_constant") / known["inverter_loss_constant"]
-    away = []
-    for seed in range(0, 300, 3):
-        errs = {
-            "inverter_gain": 1 + RIDE.gain_sd * rng.normal(),
-            "own_loss": 1 + own_sd * rng.normal(),
-            "auxiliary_sign": 1 + RIDE.shunt_sd * rng.normal(),
-        }
-        *drifts, next_one = RIDE.drift_sd * rng.normal(size=4)  # the offset's sd is of a ride to come
-        rides = [ride(seed + k, seconds=200, drift=drift, **errs) for k, drift in enumerate(drifts)]
-        found = offsets(rides, VEHICLE).parameters
-        truths = {"pack_current_gain": GAIN, "pack_current_offset": OFFSET + next_one}
-        away.append([(found[name].value - truth) / found[name].sd for name, truth in truths.items()])
-    gain, offset = np.mean(np.abs(away) < 1.96, axis=0)
-    assert 0.9 <= gain <= 0.99
-    assert 0.9 <= offset <= 0.99
-
-
-def test_noise_is_that_of_a_sample():
-    found = offsets([ride(seed) for seed in range(3)], VEHICLE).parameters
-    assert found["pack_current_noise"].value == pytest.approx(CURRENT_NOISE, rel=0.1)
-    assert found["pack_voltage_noise"].value == pytest.approx(VOLTAGE_NOISE, rel=0.1)
 
 
 def test_what_two_sensors_cannot_tell_is_said():
@@ -149,19 +111,11 @@ def test_without_any_other_current_there_is_no_offset():
     assert "pack_current_offset: needs inverter_current, or auxiliary_current" in result.refusals[0]
 
 
-def test_a_ride_without_the_inverters_sensors_beside_others_is_left_out_and_named():
-    result = offsets([ride(0), ride(1), ride(2, drop=INVERTER)], VEHICLE)
-    assert any(note.startswith("ride_2: left out") for note in result.notes)
-
-
-def test_auxiliary_power_is_the_mean_over_the_rides():
-    found = auxiliary_power([ride(seed) for seed in range(4)], VEHICLE).parameters["auxiliary_power"]
-    assert UNLIT < found.value < LIT and 0 < found.sd < 3
-
-
 def test_a_ride_without_the_sensor_is_left_out_and_none_at_all_refused():
-    without = ride(0, drop=["auxiliary_current"])
-    assert any("no auxiliary_current" in note for note in auxiliary_power([ride(1), without], VEHICLE).notes)
+    result = auxiliary_power([*(ride(seed) for seed in range(1, 5)), ride(0, drop=["auxiliary_current"])], VEHICLE)
+    assert "ride_0: no auxiliary_current, left out" in result.notes
+    found = result.parameters["auxiliary_power"]
+    assert UNLIT < found.value < LIT and 0 < found.sd < 3
     with pytest.raises(InputError, match="no ride has auxiliary_current"):
         auxiliary_power([ride(0, drop=["auxiliary_current", "pack_current"])], VEHICLE)
     with pytest.raises(InputError, match="must be positive when consuming"):
@@ -195,17 +149,6 @@ def pulse(temperature, ohm, sign=1):
     )
 
 
-def test_cable_intervals_hold_voltage_sensors_of_their_class():
-    """Over scooters whose two voltage sensors err in gain."""
-    rng, held, count = np.random.default_rng(0), 0, 100
-    for seed in range(count):
-        gains = tuple(1 + RIDE.voltage_gain_sd * rng.normal(size=2))
-        rides = [ride(3 * seed + k, seconds=200, voltage_gains=gains) for k in range(3)]
-        found = cable_resistance(rides, VEHICLE).parameters["cable_resistance"]
-        held += abs(found.value - CABLE) < 1.96 * found.sd
-    assert 0.9 <= held / count <= 0.99, held
-
-
 def test_cell_steps_are_the_resistance_at_once():
     temperature, logarithm = cell_steps([pulse(40.0, 0.03), pulse(10.0, 0.06)])
     assert np.allclose(temperature, [10, 40]) and np.allclose(np.exp(logarithm), [0.06, 0.03])
@@ -227,23 +170,8 @@ def test_a_vehicle_of_small_currents_needs_small_steps():
     rides = [ride(seed) for seed in range(4)]
     for columns in (one.columns for one in rides):
         columns |= {role: (t, x / 8) for role, (t, x) in columns.items() if role.endswith("current")}
-    found = pack_series_resistance(rides, small, [pulse(10.0, 8 * CELL_STEP), pulse(40.0, 8 * CELL_STEP)])
-    series = found.parameters["pack_series_resistance"]
-    assert abs(series.value - 8 * SERIES) < 1.96 * series.sd and "above 1.875 A" in series.source
     cable = cable_resistance(rides, small).parameters["cable_resistance"]
     assert abs(cable.value - 8 * CABLE) < 1.96 * cable.sd
-
-
-def test_series_intervals_hold_cells_that_differ():
-    """Over packs whose cells are not those of the pulse test, by what cells scatter."""
-    pulses, rng = [pulse(10.0, CELL_STEP), pulse(40.0, CELL_STEP)], np.random.default_rng(0)
-    held, count = 0, 60
-    for seed in range(count):
-        cell = CELL_STEP * (1 + RIDE.cells_sd * rng.normal())
-        rides = [ride(3 * seed + k, seconds=200, cell=cell, series=2 * SERIES) for k in range(3)]
-        found = pack_series_resistance(rides, VEHICLE, pulses).parameters["pack_series_resistance"]
-        held += abs(found.value - 2 * SERIES) < 1.96 * found.sd
-    assert 0.9 <= held / count <= 0.99
 
 
 def test_no_number_where_the_cells_own_doubt_is_greater():
@@ -263,3 +191,55 @@ def test_rides_without_steps_are_refused():
     without = resistances([ride(0)], VEHICLE)
     assert "cable_resistance" in without.parameters
     assert "pack_series_resistance: needs pulse tests" in without.refusals[0]
+
+
+def receivers(seed, rng):
+    """wheel_radius of receivers that err, each one on all its rides."""
+    bias = rng.normal(0, RIDE.receiver_sd)
+    return wheel_radius([gps_ride(0.24, 10 * seed + k, minutes=3, bias=bias) for k in range(3)], VEHICLE), 0.24
+
+
+def instruments(seed, rng):
+    """Offset on a ride to come, of scooters whose sensors and inverter's own loss err as their class and file say."""
+    known = VEHICLE.parameters
+    own_sd = known.sd("inverter_loss_constant") / known["inverter_loss_constant"]
+    errs = {"own_loss": 1 + own_sd * rng.normal(), "auxiliary_sign": 1 + RIDE.shunt_sd * rng.normal()}
+    *drifts, to_come = RIDE.drift_sd * rng.normal(size=4)
+    rides = [ride(3 * seed + k, seconds=200, drift=drift, **errs) for k, drift in enumerate(drifts)]
+    return offsets(rides, VEHICLE), OFFSET + to_come
+
+
+def gains(seed, rng):
+    gain = 1 + RIDE.gain_sd * rng.normal()
+    return offsets([ride(3 * seed + k, seconds=200, inverter_gain=gain) for k in range(3)], VEHICLE), GAIN
+
+
+def voltmeters(seed, rng):
+    """Cables of scooters whose two voltage sensors err in gain."""
+    errs = tuple(1 + RIDE.voltage_gain_sd * rng.normal(size=2))
+    return cable_resistance([ride(3 * seed + k, seconds=200, voltage_gains=errs) for k in range(3)], VEHICLE), CABLE
+
+
+def packs(seed, rng):
+    """Packs whose cells are not those of the pulse test, by what cells scatter."""
+    cell = CELL_STEP * (1 + RIDE.cells_sd * rng.normal())
+    rides = [ride(3 * seed + k, seconds=200, cell=cell, series=2 * SERIES) for k in range(3)]
+    return pack_series_resistance(rides, VEHICLE, [pulse(10.0, CELL_STEP), pulse(40.0, CELL_STEP)]), 2 * SERIES
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "count"),
+    [
+        ("wheel_radius", receivers, 60),
+        ("pack_current_offset", instruments, 100),
+        ("pack_current_gain", gains, 100),
+        ("cable_resistance", voltmeters, 100),
+        ("pack_series_resistance", packs, 60),
+    ],
+)
+def test_intervals_hold_instruments_and_cells_that_err_as_their_class_does(name, found, count):
+    rng, held = np.random.default_rng(0), 0
+    for seed in range(count):
+        result, truth = found(seed, rng)
+        held += abs(result.parameters[name].value - truth) < 1.96 * result.parameters[name].sd
+    assert 0.9 <= held / count <= 0.99

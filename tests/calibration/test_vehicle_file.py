@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,31 +29,21 @@ def found(name: str, value: float, sd: float = 0.1, source: str = "a test") -> F
 
 @st.composite
 def results(draw: st.DrawFn) -> Result:
-    """Any parameters within their bounds, correlated in any way, and battery tables."""
+    """Any parameters within their bounds, correlated in any way, and a battery table."""
+    rng = np.random.default_rng(draw(st.integers(0, 1000)))
     plain = sorted(set(DECLARED) - {"cell_resistance_factor"})  # which scales the tables as they are read
-    names = draw(st.lists(st.sampled_from(plain), min_size=1, max_size=8, unique=True))
+    names = tuple(rng.choice(plain, rng.integers(1, 9), replace=False).tolist())
     parameters = {}
     for name in names:
-        p = DECLARED[name]
-        value = float(f"{draw(st.floats(p.low, p.high)):.6g}")
-        value = min(max(value, p.low), p.high)
-        parameters[name] = found(name, value, draw(st.floats(0, 1e3)), draw(st.text(max_size=30)))
-    factors = np.array(draw(st.lists(st.floats(-2, 2), min_size=len(names) ** 2, max_size=len(names) ** 2)))
-    factors = factors.reshape(len(names), len(names))
-    soc = np.array(sorted(draw(st.sets(st.integers(0, 100), min_size=2, max_size=8)))) / 100
-    temperature = np.array(sorted(draw(st.sets(st.integers(-30, 60), min_size=1, max_size=4))), dtype=float)
-    shape = (len(temperature), len(soc))
-    n = len(temperature) * len(soc)
-    ohms = np.array(draw(st.lists(st.floats(1e-4, 1), min_size=n, max_size=n)))
-    sd = ohms.copy()
-    sd[draw(st.integers(0, len(sd) - 1))] = np.nan
-    axes = {"soc": soc, "temperature": temperature}
-    return Result(
-        "test",
-        parameters,
-        {"battery.r0": Curve(axes, ohms.reshape(shape), sd.reshape(shape), "ohm", draw(st.text(max_size=9)))},
-        [(tuple(names), factors @ factors.T)],
-    )
+        low, high = DECLARED[name].low, DECLARED[name].high
+        value = min(max(float(f"{rng.uniform(low, high):.6g}"), low), high)
+        parameters[name] = found(name, value, rng.uniform(0, 1e3), draw(st.text(max_size=30)))
+    factors = rng.uniform(-2, 2, (len(names), len(names)))
+    axes = {"soc": np.sort(rng.choice(100, 6, replace=False)) / 100, "temperature": np.array([-10.0, 25.0])}
+    ohms = rng.uniform(1e-4, 1, (2, 6))
+    sd = np.where(rng.uniform(size=ohms.shape) < 0.1, np.nan, ohms)
+    curve = Curve(axes, ohms, sd, "ohm", draw(st.text(max_size=9)))
+    return Result("test", parameters, {"battery.r0": curve}, [(names, factors @ factors.T)])
 
 
 @settings(max_examples=20, deadline=None)
@@ -84,31 +73,9 @@ def test_what_is_written_is_read_again(tmp_path_factory, result):
     assert after.battery.ocv_curve == before.battery.ocv_curve
     assert (after.riding, after.name) == (before.riding, before.name)
     assert after.mapping.sources == before.mapping.sources
-    # once more changes nothing
     text = out.read_text()
-    assert merged(text, [result], out, out) == text
-
-
-def without_calibrated(text: str, result: Result) -> dict[str, Any]:
-    document = tomllib.loads(text)
-    for name in result.parameters:
-        document["parameters"].pop(name, None)
-    for name in result.curves:
-        document["battery"].pop(name.partition(".")[2], None)
-    document.pop("correlation", None)
-    return document
-
-
-@settings(max_examples=20, deadline=None)
-@given(results())
-def test_what_was_not_calibrated_stays_as_it_is(result):
-    base = REFERENCE.read_text()
-    text = merged(base, [result], REFERENCE, REFERENCE)
-    assert without_calibrated(text, result) == without_calibrated(base, result)
-    comments = [line for line in base.splitlines() if line.startswith("#")]
-    assert [line for line in text.splitlines() if line.startswith("#")][: len(comments)]
-    for line in comments:
-        assert line in text
+    assert merged(text, [result], out, out) == text  # once more changes nothing
+    assert all(line in text for line in REFERENCE.read_text().splitlines() if line.startswith("#"))
 
 
 @pytest.mark.parametrize("style", ["inline", "table", "dotted", "none"])
@@ -189,13 +156,12 @@ def test_effects_of_ones_own_go_along(tmp_path):
 @pytest.mark.parametrize(
     ("result", "message"),
     [
-        (Result("t", {"drag_area": Found(9.0, 0.1, "m²", "x")}), "drag_area: 9 m² was found, outside 0.05 to 8 m²"),
-        (Result("t", {"drag_area": Found(0.5, 0.1, "m", "x")}), "drag_area: was found in m, but is in m²"),
-        (Result("t", {"drag_area": Found(0.5, np.nan, "m²", "x")}), "standard deviation came out as nan"),
-        (Result("t", {"drag_area": Found(np.nan, 0.1, "m²", "x")}), "drag_area: nan"),
+        (Result("t", {"drag_area": Found(9.0, 0.1, "m²", "x")}), r"v.toml:\d+: .*value: 9 m² is outside 0.05 to 8 m²"),
+        (Result("t", {"drag_area": Found(0.5, 0.1, "m", "x")}), "drag_area.unit: unit 'm' is wrong"),
+        (Result("t", {"drag_area": Found(0.5, np.nan, "m²", "x")}), "drag_area.sd: must be a finite number"),
         (
             Result("t", curves={"battery.r0": Curve({"soc": np.ones(2)}, np.ones(3), np.ones(3), "ohm", "x")}),
-            r"battery.r0: must be \(2,\) finite numbers",
+            "battery.r0.soc: must increase",
         ),
         (Result("t", covariance=[(("drag_area",), np.ones((1, 1)))]), "covariance of drag_area, which was not found"),
     ],
