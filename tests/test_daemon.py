@@ -7,8 +7,6 @@ import logging
 import os
 import resource
 import shutil
-import subprocess
-import sys
 import threading
 import time
 import zlib
@@ -419,28 +417,6 @@ def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, mo
 
 # --- alone -------------------------------------------------------------------------------------------------------
 
-HOLDING = """
-import sys, time
-from contextlib import ExitStack
-from pathlib import Path
-from gz_onboard.daemon import command
-with ExitStack() as locks:
-    command._lock(locks, sys.argv[1], [sys.argv[2]], Path(sys.argv[3]))
-    print("held", flush=True)
-    time.sleep(60)
-"""
-
-
-@contextmanager
-def holder(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Another daemon, as far as its locks go."""
-    command = [sys.executable, "-c", HOLDING, *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "held\n"
-        yield process
-        process.kill()
-
 
 def take(interface: str, name: str, folder: Path) -> None:
     with ExitStack() as locks:
@@ -449,7 +425,8 @@ def take(interface: str, name: str, folder: Path) -> None:
 
 def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(tmp_path: Path):
     name = f"can{os.getpid()}"  # the names are those of the whole machine
-    with holder("socketcan", name, tmp_path / "a"):
+    with ExitStack() as first:
+        _lock(first, "socketcan", [name], tmp_path / "a")
         with pytest.raises(InputError, match=f"--channel {name}: another gz-onboard run has it"):
             take("socketcan", name, tmp_path / "b")
         with pytest.raises(InputError, match=r"--state-dir .*another gz-onboard run uses it"):

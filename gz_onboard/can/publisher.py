@@ -1,8 +1,8 @@
 """Encode estimates as CAN frames: the range at 1 Hz, the status at 10 Hz.
 
-The layout comes from ``dbc/range.dbc``, or from another DBC file with messages and signals of the same names but other
-scales, identifiers and places. An unknown value, or one that its signal cannot hold, is sent as not available, never
-as a number; counts stop at their maximum.
+The layout comes from ``dbc/range.dbc``, or from another DBC file with the same messages and signals but other scales
+and identifiers. An unknown value, or one that its signal cannot hold, is sent as not available, never as a number;
+counts stop at their maximum.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from gz_onboard.can.dbc import database_of, find_dbc, read_dbc
-from gz_onboard.can.layout import crc8_sae_j1850, first_bit, identifier_of, raw_range
+from gz_onboard.can.layout import crc8_sae_j1850, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, MOST_STANDARD, TRANSMITTED, Estimate, Frame, Reason, State
@@ -198,54 +198,49 @@ def _range_messages(file: Path, text: str) -> dict[str, Message]:
 
 def _message_problem(message: Message, wanted: Message) -> str:
     """Why `message` cannot carry the signals of `wanted`, a message of ``dbc/range.dbc``; empty if it can."""
-    if message.length != 8 or message.is_fd:
+    if message.length != LENGTH or message.is_fd:
         return f"must have 8 bytes in a classic frame, has {message.length}{' in a CAN FD frame' * message.is_fd}"
-    signals = {signal.name: signal for signal in message.signals}
-    if len({signal.byte_order for signal in message.signals}) > 1:
-        return "its signals must all have the same byte order"
-    for model in wanted.signals:
-        if model.name not in signals:
-            return f"has no signal {model.name}{nearest(model.name, signals)}"
-        if problem := _signal_problem(signals[model.name], model):
-            return f"signal {model.name} {problem}"
-    return ""
+    signals, models = ({signal.name: signal for signal in one.signals} for one in (message, wanted))
+    if missing := [name for name in models if name not in signals]:
+        return f"has no signal {missing[0]}{nearest(missing[0], signals)}"
+    if more := [name for name in signals if name not in models]:
+        return f"has a signal {more[0]}, which {RANGE_DBC} has not"
+    problems = ((name, _signal_problem(signals[name], model)) for name, model in models.items())
+    return next((f"signal {name} {problem}" for name, problem in problems if problem), "")
 
 
 def _signal_problem(signal: Signal, model: Signal) -> str:
-    if signal.conversion.is_float or signal.is_multiplexer or signal.multiplexer_ids is not None:
-        return "must be an integer that is in every frame (not floating point, not multiplexed)"
-    if model.name.endswith("CRC"):
-        return "" if (signal.length, first_bit(signal)) == (8, 56) else "must be the last byte, all 8 bits of it"
-    if first_bit(signal) + signal.length > 56:
-        return "stands in the last byte, which is the checksum's"
-    unit = model.unit or ""
-    if (signal.unit or "") != unit:
-        return f"has unit {signal.unit or ''!r}, must have {unit!r}; only its scale and place may differ"
+    """Why `signal` cannot take the part of `model`, from which its scale, offset and limits may differ."""
+    if _place(signal) != _place(model):
+        return f"is {_place(signal)}, must be {_place(model)}; only its scale, offset and limits may differ"
     if model.length >= 8:  # a quantity, with a code for not available
-        if signal.length < 8:
-            return f"needs 8 bits or more for the code 'not available', has {signal.length}"
         needed = (0, 1) if model.name == SOC else (0,)
-        missing = [value for value in needed if _Field(signal, "").raw(value) is None]
-        return f"must be able to say {100 * missing[0]} {unit}".rstrip() if missing else ""
+        missing = [] if model.name.endswith("CRC") else [v for v in needed if _Field(signal, "").raw(v) is None]
+        return f"must be able to say {100 * missing[0]} {model.unit or ''}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
     is_whole = (signal.conversion.scale, signal.conversion.offset, low) == (1, 0, 0) and high >= most
     return "" if is_whole else f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
 
 
+def _place(signal: Signal) -> str:
+    """Place, byte order, sign and unit of a signal as a DBC file has them."""
+    kind = "floating point " if signal.conversion.is_float else "" if signal.multiplexer_ids is None else "multiplexed "
+    order, sign = 1 if signal.byte_order == "little_endian" else 0, "-" if signal.is_signed else "+"
+    return f'{kind}{signal.start}|{signal.length}@{order}{sign} "{signal.unit or ""}"'
+
+
 class _Field:
     """The place of a signal in its message, an integer of the first seven bytes, and its raw values."""
 
     def __init__(self, signal: Signal, message: str) -> None:
-        first = first_bit(signal)
         unit = _SI.get(signal.unit or "", 1.0)
         self.message = message
         self.low, self.high = raw_range(signal, not_available=True)
         self.scale, self.offset = float(signal.conversion.scale) * unit, float(signal.conversion.offset) * unit
         self.mask = (1 << int(signal.length)) - 1
-        is_whole = signal.name.startswith("RANGE_") and not signal.unit
-        self.blank = 0 if is_whole else self.mask // 2 + 1 if signal.is_signed else self.mask  # or not available
-        self.shift = first if signal.byte_order == "little_endian" else 56 - first - signal.length
+        self.blank = 0 if not signal.unit else self.mask // 2 + 1 if signal.is_signed else self.mask  # or not available
+        self.shift = int(signal.start)
 
     def raw(self, value: float | None) -> int | None:
         """The nearest raw value of one in SI units; None if that is unknown, not finite or cannot be said."""
@@ -264,12 +259,11 @@ class _Encoder:
         for field in fields.values():
             self.blank ^= (field.mask ^ field.blank) << field.shift
         self._identifier, self._counter_field = identifier, fields.pop(f"{message.name}Counter")
-        self._order: Literal["little", "big"] = "little" if message.signals[0].byte_order == "little_endian" else "big"
         self._counter = 0  # of the next frame
         self.fields = fields
 
     def frame(self, word: int, time_ns: int) -> Frame:
         """The next frame, whose signals have the bits of `word`."""
-        data = (word | self._counter << self._counter_field.shift).to_bytes(7, self._order)
+        data = (word | self._counter << self._counter_field.shift).to_bytes(7, "little")
         self._counter = (self._counter + 1) % (int(self._counter_field.high) + 1)
         return time_ns, self._identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED

@@ -44,7 +44,7 @@ def test_a_range_too_long_for_its_range_frames_is_refused(tmp_path):
     dbc = (
         find_dbc("range.dbc")
         .read_text(encoding="utf-8")
-        .replace("0|16@1+ (0.01,0) [0|655.34]", "0|12@1+ (0.01,0) [0|40]")
+        .replace("0|16@1+ (0.01,0) [0|655.34]", "0|16@1+ (0.01,0) [0|40]")
     )
     with pytest.raises(
         InputError, match=r"van\.toml: .*range from full is 5\d km, .*RANGE_Remaining .*mine\.dbc .*40 km"
