@@ -392,7 +392,7 @@ class BatteryPack:
         voltage, pack_current = measured
         shown, current = battery.cell_voltage(voltage, pack_current), pack_current / battery.cells_parallel
         drop = cell.r0 * current + effects.overpotential
-        self._follow_sag(now, dt, voltage, pack_current, reading)
+        self._follow_sag(dt, voltage, pack_current, reading)
         self.state = state = self.age.permit(now, reading, self._signals, self.state)
         if replaced := self.age.another_pack(state):
             self.state = state = replaced
@@ -426,17 +426,16 @@ class BatteryPack:
             self.state = self.age.load(self.state, min(dt, self._signals.pause), drop + state.v1, error)
         self.age.follow(self.state, dt)
 
-    def _follow_sag(self, now: float, dt: float, voltage: float, current: float, reading: PackReading) -> None:
+    def _follow_sag(self, dt: float, voltage: float, current: float, reading: PackReading) -> None:
         """Compare the changes of the voltage with those that a measured current explains, for the sensor checks."""
-        battery, lost, explaining = self.battery, self.effects.overpotential, current
-        if reading.source not in (CurrentSource.PACK, CurrentSource.INVERTER):
-            if reading.reported_current is None:
-                return
-            explaining = reading.reported_current
-            lost = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
-        # Both with the resistance outside the cells: of a pack of which little is known, r0 may include it.
+        battery, is_measured = self.battery, reading.source in (CurrentSource.PACK, CurrentSource.INVERTER)
+        explaining = current if is_measured else reading.reported_current
+        if explaining is None:
+            return
+        # With the resistance outside the cells: of a pack of which little is known, r0 may include it.
         resistance = self._cell.r0 / battery.cells_parallel + battery.series_resistance / battery.cells_series
-        self._sag.update(dt, resistance * explaining + lost, -voltage / battery.cells_series)
+        drop = resistance * explaining + self.effects.overpotential
+        self._sag.update(dt, drop, -voltage / battery.cells_series)
 
     def _take_rest(self, dt: float, volts: float, current: float, reading: PackReading, temperature: float) -> bool:
         """Condition the state on a rest that is better proven than before; returns whether it did."""
@@ -572,16 +571,16 @@ class BatteryPack:
         """Start from the `first` voltage and the state that was believed."""
         battery, effects, past = self.battery, self.effects, self.past
         power = load.power_of_prior(now)
+        self._joined = bool(first.moving) and not past
         if self._unseen:
             drawn = first.current
-            if first.moving and not past:
+            if self._joined:
                 before = power / first.voltage / battery.cells_parallel
                 effects.step(battery, PACK.joined_s, before, HALF_FULL, temperature)
             elif not first.moving:
                 drawn = standing_load(drawn, first.voltage, self._auxiliary_power)
             effects.step(battery, self._unseen, drawn / battery.cells_parallel, HALF_FULL, temperature)
             self._unseen = 0.0
-        self._joined = bool(first.moving) and not past
         first = first._replace(
             temperature=temperature,
             overpotential=effects.overpotential,
@@ -590,12 +589,16 @@ class BatteryPack:
         )
         vehicle = Past(first.current, self._signals.odometer.get(now), self._signals.bms_state_of_charge.get(now))
 
-        def least_variance(soc: float) -> float:
-            self.age.is_learning = True
-            return self.age.least_variance(self.state, soc, battery.ocv(soc)[1])
-
+        self.age.is_learning = True
         state = first_state(
-            battery, self.voltage_noise, self.state, first, past, self.past_age, vehicle, least_variance
+            battery,
+            self.voltage_noise,
+            self.state,
+            first,
+            past,
+            self.past_age,
+            vehicle,
+            lambda soc: self.age.least_variance(self.state, soc, battery.ocv(soc)[1]),
         )
         self.state, self.is_started, self.past, self.past_age = state, True, None, None
         self.age.apply(state)

@@ -294,11 +294,6 @@ def first_state(
     slow_sd = hypot(noise.rest, first.voltage_sd, noise.loaded(rough, temperature) if loaded else 0.0)
     once_sd = hypot(noise.resistance * (r0 * current + first.overpotential), first.unsteady_sd)
     if past and age is not None:
-        if not loaded and past.own_soc is not None and now.own_soc is not None:
-            charged = abs(now.own_soc - past.own_soc) > PRIOR.own_soc_sd
-            ridden_since = past.odometer is None or past.odometer != now.odometer
-            if not (charged or ridden_since):
-                v1_sd *= exp(-age / PRIOR.relaxation_s)
         if age < PRIOR.relaxed_s:
             decay = exp(-age / (r1 * c1))
             v1 += (believed.v1 - v1) * decay

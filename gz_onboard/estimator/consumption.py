@@ -43,7 +43,6 @@ class ConsumptionConfig:
     recent_m: float = 1000.0  # the same for the recent consumption
     prior_m: float = 3000.0  # riding that the prior riding counts for in the sums
     history_segments: int = 40  # 10 km that a fault found later can be unlearned of
-    steepest: float = 0.3  # sine: no road is steeper
     acceleration_limit: float = 15.0  # m/s²: no road gives more; a second that shows more is left out
     ride_ends_s: float = 600.0  # standstill after which another ride begins
     tyres_cool_s: float = 3600.0  # standstill after which tyres are cold
@@ -136,6 +135,10 @@ class LearnedQuantity(NamedTuple):
             both - gain * (both + own),
         )
 
+    def scaled(self, by: float) -> LearnedQuantity:
+        """The same quantity in a unit that is `by` times smaller."""
+        return LearnedQuantity(*(x * by**power for x, power in zip(self, (1, 2, 2, 2, 1, 2, 2), strict=True)))
+
     def ahead(self, distance: float) -> tuple[float, float]:
         """(mean over the next `distance` [m], its variance): of a Gauss-Markov process given now, and its scatter."""
         lengths = max(distance, 1.0) / CONSUMPTION.fade_m
@@ -157,10 +160,6 @@ class LearnedQuantity(NamedTuple):
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
         more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
         return self._replace(deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
-
-    def scaled(self, by: float) -> LearnedQuantity:
-        """The same quantity in a unit that is `by` times smaller."""
-        return LearnedQuantity(*(x * by**power for x, power in zip(self, (1, 2, 2, 2, 1, 2, 2), strict=True)))
 
 
 class Habits(NamedTuple):
@@ -259,7 +258,7 @@ class Terrain(NamedTuple):
         way, climb, unseen = self.way + way, self.climb + climb, self.unseen + unseen
         if way < stretch:
             return Terrain(self.squares, self.stretches, way, climb, unseen)
-        if unseen > way / 5 or abs(climb) > CONSUMPTION.steepest * way:
+        if unseen > way / 5 or abs(climb) > MOTION.max_grade * way:
             return Terrain(self.squares, self.stretches)
         keep = 1 - 1 / CONSUMPTION.terrain_memory
         return Terrain(keep * self.squares + climb * climb * stretch / way, keep * self.stretches + 1)
@@ -412,7 +411,7 @@ class ConsumptionLearner:
             self.pause()
             return
         way, moving = abs(second.distance), abs(mean) > MOVING
-        slope = max(min(second.climb / way, c.steepest), -c.steepest) if moving else 0.0
+        slope = max(min(second.climb / way, MOTION.max_grade), -MOTION.max_grade) if moving else 0.0
         q = self.load.quantities(mean, acceleration, conditions, slope, self.load.time_moving)
         modelled, repeated = (second.seconds * power for power in self.load.power_ridden(q, second.seconds))
         stored = self._weight * second.climb + self._moving_mass * (speed * speed - start * start) / 2

@@ -282,13 +282,10 @@ class RangeExplainer:
         for share, speed in ways:
             time = share / speed  # s for each metre of the whole way
             q = self._load.quantities(speed, 0.0, straight)
-
-            def drawn(**motion: float) -> float:
-                return self._calm.power(q | motion)  # noqa: B023
-
-            level = drawn()
+            level, bend = self._calm.power(q), self._calm.power(q | {"lateral_acceleration": lateral})
+            up, down = self._calm.power(q | {"grade": grade}), self._calm.power(q | {"grade": -grade})
             parts[Cause.SPEED] += time * level
-            parts[Cause.TURNING] += time * (drawn(lateral_acceleration=lateral) - level)
-            parts[Cause.CLIMB] += time * ((drawn(grade=grade) + drawn(grade=-grade)) / 2 - level)
+            parts[Cause.TURNING] += time * (bend - level)
+            parts[Cause.CLIMB] += time * ((up + down) / 2 - level)
             parts[Cause.WIND] += time * (self._load.power(q) - level)
         return parts

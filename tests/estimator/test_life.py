@@ -280,6 +280,7 @@ def test_a_restart_knows_what_it_does_not_know(make, seconds, speed, charge, tol
     assert worst(rows) < 3
     _, end = rows[-1]
     without = fresh.estimate(scooter.time)
+    assert end.activity is Activity.RIDING, "what was saved is of before this ride: none was joined"
     assert end.soc_sd < ((0.6 if make is Scooter else 0.7) if clock and seconds <= 60 else 1.2) * without.soc_sd
     assert without.reasons & Reason.PRIOR_RIDING
     assert not end.reasons & Reason.PRIOR_RIDING  # what a kilometre costs is known at once, whatever has flowed

@@ -86,3 +86,11 @@ def test_resistances_that_are_guessed_make_a_loaded_voltage_worth_less():
     measured, guessed = (VoltageNoise(VEHICLE.pack, p) for p in (parameters, Parameters(known)))
     fast = [noise.fast(0.04, (0.05, 0.03), CurrentSource.PACK, noise.resistance, 0.0) for noise in (measured, guessed)]
     assert fast[1] > 10 * fast[0]
+
+
+def test_a_loaded_cell_errs_more_the_nearer_it_is_to_empty():
+    noise, (empty, begins) = VoltageNoise(VEHICLE.pack, VEHICLE.parameters), PRIOR.empty
+    near_empty, full = VEHICLE.parameters.sd("cell_voltage_error_empty"), VEHICLE.pack.voltage_error(25.0, noise.model)
+    sds = [noise.loaded(soc, 25.0) for soc in (empty, (empty + begins) / 2, begins)]
+    assert sds == pytest.approx([near_empty, (near_empty + full) / 2, full])
+    assert full < near_empty

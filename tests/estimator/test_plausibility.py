@@ -372,3 +372,17 @@ def test_a_single_witness_of_the_grade_is_held_against_the_energy():
     for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
         role, fault = GRADE_FAULTS[name]
         assert hills(800.0, {role: fault}, (role,)).faulty == {role}
+
+
+def test_a_speed_that_comes_every_two_seconds_accuses_no_accelerometer():
+    """Between two of its messages the held speed shows no acceleration, and the accelerometer does."""
+    grades = grade_check()
+    signals, speeds = grades.signals, grades.speeds
+    for step in range(1200):
+        t = step * STEP
+        acceleration = (town(t) - town(t - STEP)) / STEP
+        signals.show(t, {"accel_x": acceleration + 0.1 * sin(77 * t)})
+        if step % 20 == 0:
+            speeds.median, signals.motor_speed.time = town(t), t
+        grades.step(t, STEP, speeds.median)
+    assert not grades.faulty
