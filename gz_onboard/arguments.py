@@ -8,7 +8,6 @@ from __future__ import annotations
 import collections.abc
 import functools
 import inspect
-import os
 import re
 import types
 from collections.abc import Callable, Collection, Mapping
@@ -27,7 +26,7 @@ _WORDS: dict[object, str] = {float: "a number", int: "a whole number", bool: "Tr
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, which raises InputError for an argument that is not what its hint says, or names no possible file."""
+    """`function`, which raises InputError for an argument that is not what its hint says."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -75,8 +74,6 @@ def check(name: str, value: object, hint: Any) -> None:
 
 def fits(value: object, hint: Any) -> bool:
     """Whether `value` is what a type hint says; of a protocol always, as it says itself what it lacks."""
-    if isinstance(value, str | os.PathLike) and not _possible(str(value)):
-        return False
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)
@@ -101,11 +98,3 @@ def fits(value: object, hint: Any) -> bool:
             return False
         return all(fits(one, parts[0]) for one in value) if isinstance(value, Collection) else True
     return True
-
-
-def _possible(name: str) -> bool:
-    """Whether a file could be called that: no NUL, no half of a character."""
-    try:
-        return b"\0" not in os.fsencode(name)
-    except UnicodeEncodeError:
-        return False

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 
 from gz_onboard import __version__, state
@@ -21,7 +21,7 @@ from gz_onboard.can.logfile import LogFile
 from gz_onboard.can.recorder import is_complete
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.estimation.ride import RideOptions, known_vehicle, open_estimate, run_ride, state_for, vehicle_of
-from gz_onboard.estimation.saved_state import MAX_OVERLAP_S, RideState, latest, locked, save_state, saved_at, when
+from gz_onboard.estimation.saved_state import RideState, latest, locked, save_state, saved_at
 from gz_onboard.estimation.summary import (
     SUMMARY_VERSION,
     TABLE_FORMATS,
@@ -158,7 +158,6 @@ def in_order(
     """Sort tasks by the times of their rides, each with the state `file` to continue from; and those without a time.
 
     Of an earlier run those results are kept that the state includes: of rides that ended before it was saved.
-    InputError naming the logs if two overlap or are of two vehicles.
     """
     found: list[tuple[RideState, EstimateTask]] = []
     unread: list[tuple[EstimateTask, InputError]] = []
@@ -169,18 +168,6 @@ def in_order(
         except InputError as error:
             unread.append((task, error))
     found.sort(key=lambda one: one[0].begin_ns)
-    for (one, before), (other, after) in pairwise(found):
-        if one.vehicle != other.vehicle:
-            raise InputError(
-                f"{before.path} is of {one.vehicle} and {after.path} of {other.vehicle}: "
-                "a saved state is of one vehicle"
-            )
-        if (one.end_ns - other.begin_ns) * 1e-9 > MAX_OVERLAP_S:
-            times = (f"{when(ride.begin_ns * 1e-9)} to {when(ride.end_ns * 1e-9)}" for ride in (one, other))
-            raise InputError(
-                f"{before.path} and {after.path} overlap: {' and '.join(times)}; "
-                "a saved state goes from one ride to the next; give one of the two"
-            )
     saved = _saved_ns(file)
     return [replace(task, state=at, resume=task.resume and at.end_ns <= saved) for at, task in found], unread
 

@@ -265,7 +265,7 @@ def state_for(file: Path, ride: OpenRide, facts: Mapping[str, object]) -> RideSt
         raise InputError(
             f"{ride.source}: rides.json: rider {rider!r}: must have at most {CONSUMPTION.most_name_letters} letters"
         )
-    return RideState(file, codec.time_ns(0.0), codec.last_ns, ride.vehicle.name, rider)
+    return RideState(file, codec.time_ns(0.0), codec.last_ns, rider)
 
 
 def vehicle_of(task: Task) -> Vehicle:

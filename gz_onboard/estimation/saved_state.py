@@ -27,13 +27,12 @@ _FAR_FUTURE_S = 1e11  # since the epoch
 class RideState:
     """The file of a saved state, and the ride that continues from it.
 
-    begin_ns, end_ns: of the ride [ns since the epoch]; vehicle: its name; rider: empty if unknown.
+    begin_ns, end_ns: of the ride [ns since the epoch]; rider: empty if unknown.
     """
 
     file: Path
     begin_ns: int
     end_ns: int
-    vehicle: str
     rider: str = ""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -118,12 +117,12 @@ class ExportSource:
     @cached_property
     def section(self) -> tuple[int | None, int | None]:
         """The part of the frames that is wanted [ns since the epoch]."""
-        return log_section(self.log, self._all_frames, self.start, self.end)
+        return log_section(self.log, self.all_frames, self.start, self.end)
 
     @cached_property
     def has_frames(self) -> bool:
         """Whether the log holds a frame; taken for granted of formats other than ours."""
-        return logs.log_suffix(self.log) != ".mcap" or len(logs.read_log(self.log, on_damage=lambda _: None)) > 0
+        return logs.log_suffix(self.log) != ".mcap" or len(self.all_frames) > 0
 
     @cached_property
     def topics(self) -> Mapping[str, tuple[bytes, dict[str, str]]]:
@@ -137,7 +136,7 @@ class ExportSource:
 
     def frames(self) -> FrameColumns:
         """Return the frames in the part. InputError if there are none."""
-        if len(frames := self._all_frames.between(*self.section)):
+        if len(frames := self.all_frames.between(*self.section)):
             return frames
         where = "this log" if self.section == (None, None) else "the chosen part"
         why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in self.damages)
@@ -145,7 +144,7 @@ class ExportSource:
 
     def rows(self, topic: str, begin_ns: int | None = None) -> list[Row]:
         """Return the samples of a topic in the part, which begins with the first of them or at `begin_ns`."""
-        found = self._samples.get(topic, [])
+        found = self.samples.get(topic, [])
         if not found:
             return []
         begin_ns = found[0][0] if begin_ns is None else begin_ns
@@ -159,7 +158,7 @@ class ExportSource:
             return rows
         if ESTIMATE_TOPIC in self.topics and (self.start or self.end is not None):
             raise InputError(f"{self.log}: no estimates in the chosen part")
-        has_frames = len(logs.read_log(self.log, on_damage=lambda _: None)) > 0
+        has_frames = len(self.all_frames) > 0
         hint = f"; it holds frames, of which `gz-onboard estimate {self.log.name}` makes them" if has_frames else ""
         raise InputError(f"{self.log}: holds no estimates ({ESTIMATE_TOPIC}){hint}")
 
@@ -215,7 +214,7 @@ class ExportSource:
         columns = {
             m: {n: n if n.endswith("]") else c for n, c in self.columns_of(t).items()} for m, t in topics.items()
         }
-        first = min((rows[0][0] for t in topics.values() if (rows := self._samples.get(t))), default=0)
+        first = min((rows[0][0] for t in topics.values() if (rows := self.samples.get(t))), default=0)
         for message, topic in topics.items():
             if rows := self.rows(topic, first):
                 values = {c: [v.get(n) for _, v in rows] for n, c in columns[message].items()}
@@ -223,11 +222,13 @@ class ExportSource:
         return {message: list(of.values()) for message, of in columns.items()}
 
     @cached_property
-    def _all_frames(self) -> FrameColumns:
+    def all_frames(self) -> FrameColumns:
+        """The frames of the whole log."""
         return logs.read_log(self.log, on_damage=self.damages.append)
 
     @cached_property
-    def _samples(self) -> dict[str, list[Row]]:
+    def samples(self) -> dict[str, list[Row]]:
+        """The samples of the whole log, by topic."""
         found: dict[str, list[Row]] = {}
         for topic, time_ns, values in logs.read_samples(self.log, on_damage=self.damages.append):
             found.setdefault(topic, []).append((time_ns, values))
@@ -304,25 +305,25 @@ def frame_columns(frames: FrameColumns) -> dict[str, list[Any]]:
 
 def contents_text(log: Path) -> str:
     """Say what `log` holds, by reading all of it. InputError if it cannot be read."""
-    damages: list[LogDamage] = []
-    frames = logs.read_log(log, on_damage=damages.append)
+    source = ExportSource(log)
+    frames, messages = source.all_frames, source.messages
     stamps = frames.time_ns
     back = int((stamps < np.maximum.accumulate(stamps) - BACK_NS).sum())
-    times = [int(stamps.min()), int(stamps.max())] if len(frames) else []
-    topics: Counter[str] = Counter()
-    for topic, time_ns, _ in logs.read_samples(log):
-        topics[topic] += 1
-        times = [min([time_ns, *times]), max([time_ns, *times])]
+    times = [time_ns for rows in source.samples.values() for time_ns, _ in rows]
+    if len(frames):
+        times += [int(stamps.min()), int(stamps.max())]
     rows = [(name, text) for name, text in logs.read_metadata(log).items() if name in ("vehicle", "source")]
     if times:
-        begin = datetime.fromtimestamp(times[0] // 1_000_000_000, UTC)
-        rows.append(("time", f"{clock((times[1] - times[0]) * 1e-9)} from {begin:%Y-%m-%d %H:%M:%S} UTC"))
+        begin = datetime.fromtimestamp(min(times) // 1_000_000_000, UTC)
+        rows.append(("time", f"{clock((max(times) - min(times)) * 1e-9)} from {begin:%Y-%m-%d %H:%M:%S} UTC"))
     late = f", {back} of them earlier than others before them" if back else ""
     rows.append(("frames", f"{len(frames)}{late}" if len(frames) else "none"))
-    messages = ExportSource(log).messages
-    rows += [(t.strip("/"), f"{n} rows") for t, n in topics.items() if t.removeprefix(_MESSAGE) not in messages]
+    for topic, samples in source.samples.items():
+        if topic.removeprefix(_MESSAGE) not in messages:
+            rows.append((topic.strip("/"), f"{len(samples)} rows"))
     if messages:
         rows.append(("signals", f"decoded, of {len(messages)} messages: {', '.join(sorted(messages))}"))
     if attached := sorted(logs.read_attachments(log)):
         rows.append(("DBC files", ", ".join(attached)))
-    return text_rows(str(log), [*rows, *(("damaged", str(damage)) for damage in damages)])
+    rows += [("damaged", text) for text in dict.fromkeys(map(str, source.damages))]
+    return text_rows(str(log), rows)

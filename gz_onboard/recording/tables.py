@@ -106,13 +106,8 @@ def _csv(file: Path) -> SignalTable:
 
 
 def _parquet(file: Path) -> SignalTable:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise InputError(
-            f"{file}: Parquet needs pyarrow: pip install 'gz-onboard[lab]'; or give the table as CSV"
-        ) from error
+    import pyarrow.parquet
+
     try:
         table = pyarrow.parquet.ParquetFile(file).read()  # `read_table` refuses two columns of one name
     except (OSError, pyarrow.ArrowException) as error:
@@ -125,16 +120,11 @@ def _columns_of(data: Any, name: str) -> list[tuple[str, object]]:
         return [(str(header), column) for header, column in data.items()]
     if hasattr(data, "iloc") and hasattr(data, "columns"):  # pandas, which may have two columns of one name
         columns = [(str(header), data.iloc[:, i]) for i, header in enumerate(data.columns)]
-        headers = [header for header, _ in columns]
-        if twice := next((header for header in headers if headers.count(header) > 1), None):
-            raise InputError(f"{name}: has two columns {twice!r}")
         index = str(data.index.name)
-        return [(index, data.index), *columns] if is_time(index) and index not in headers else columns
+        return [(index, data.index), *columns] if is_time(index) and index not in dict(columns) else columns
     if hasattr(data, "__arrow_c_stream__"):
-        try:
-            import pyarrow
-        except ImportError as error:
-            raise InputError(f"{name}: a {type(data).__name__} needs pyarrow; a dict of arrays does without") from error
+        import pyarrow
+
         with suppress(pyarrow.ArrowException, TypeError, ValueError, RuntimeError):  # a column alone speaks Arrow too
             table = pyarrow.table(data)
             return list(zip(table.column_names, table.columns, strict=True))

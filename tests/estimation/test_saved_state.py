@@ -211,15 +211,6 @@ def refused(out: Path, capsys: pytest.CaptureFixture[str], *rides: Path, options
     return capsys.readouterr().err
 
 
-def two_vehicles(out: Path, capsys: pytest.CaptureFixture[str], one: Path, other: Path) -> str:
-    """What is said if ``rides.json`` beside the first says another vehicle."""
-    facts = one.parent / "rides.json"
-    facts.write_text(json.dumps([{"name": one.stem, "vehicle_id": "17"}]))
-    said = refused(out, capsys, one, other)
-    facts.unlink()
-    return said
-
-
 def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
     (out := tmp_path / "out").mkdir()
     assert estimate(out, short, options=["--vehicle-id", "17"]) == 0
@@ -250,14 +241,7 @@ def test_a_signal_shows_which_vehicle_it_is(short, tmp_path):
 
 
 def test_what_does_not_go_together(short, tmp_path, capsys):
-    (tmp_path / "copy").mkdir()
-    copy = short_log(tmp_path / "copy" / "again.blf", 3000)
     (out := tmp_path / "out").mkdir()
-    said = refused(out, capsys, short, copy)
-    assert f"{short} and {copy} overlap: 2025-06-15 " in said
-    assert f"{short} is of reference-scooter-17 and {copy} of reference-scooter: a saved state is" in two_vehicles(
-        out, capsys, short, copy
-    )
     assert "--jobs 2 with --state" in refused(out, capsys, short, options=["--jobs", 2])
     undated = tmp_path / "undated.blf"
     write_log(undated, [(t % DAY, *rest) for t, *rest in recorded("coastdown", 0, 5)])  # type: ignore[misc]
@@ -268,7 +252,10 @@ def test_what_does_not_go_together(short, tmp_path, capsys):
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     assert "saves states in its folder" in refused(out, capsys, short)
     os.close(descriptor)
-    assert estimate(out, short) == 0
+    copy = short_log(tmp_path / "again.blf", 3000)
+    assert estimate(out, short, copy) == 2
+    assert f"{copy}: began at 2025-06-15 " in capsys.readouterr().err
+    assert [ride["file"] for ride in json.loads((out / "said.json").read_text())["rides"]] == [str(short)]
 
 
 def test_where_the_state_finds_no_room_it_is_named_and_the_log_is_whole(short, tmp_path, capsys):

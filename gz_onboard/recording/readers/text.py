@@ -30,16 +30,9 @@ Parser: TypeAlias = Callable[[str], Frame | None]
 """Takes a line with its line end; None for one that holds no frame. Raises ValueError for one that is damaged."""
 
 
-def read_lines(
-    data: Contents,
-    damage: LogDamage,
-    parse: Parser,
-    name: str,
-    parse_many: Callable[[str], list[Frame] | None] = lambda _text: None,
-) -> FrameColumns:
-    """Read a text log with a frame on each line.
+def read_lines(data: Contents, damage: LogDamage, parse: Parser, name: str) -> FrameColumns:
+    """Read a text log with a frame on each line. name: of the format, for messages.
 
-    parse_many: parses many lines at once; None if any line needs `parse`. name: of the format, for messages. Raises
     InputError if there is no frame before the first damage.
     """
     number, position = 0, len(BOM_UTF8) if data[: len(BOM_UTF8)] == BOM_UTF8 else 0
@@ -47,20 +40,17 @@ def read_lines(
     while position < len(data):
         end = data.find(b"\n", position + _PIECE) + 1 or len(data)
         text, position = str(data[position:end], "latin-1"), end  # bytes that are not ASCII do no harm
-        frames = parse_many(text)
-        if frames is None:
-            frames = []
-            for at, line in enumerate(StringIO(text), number + 1):
-                try:
-                    if line.strip() and (frame := parse(line)):
-                        frames.append(frame)
-                except ValueError as error:
-                    damage.add(f"line {at}", f"{error}: {shown(line.strip()[:60])}")
-            if damage.count and not frames and not parts:
-                raise InputError(f"{damage.path}, {damage.place}: cannot be read as {name}: {damage.reason}")
-        if frames:
-            parts.append(FrameColumns.of(frames))
-        number += text.count("\n")
+        frames: list[Frame] = []
+        for line in StringIO(text):
+            number += 1
+            try:
+                if line.strip() and (frame := parse(line)):
+                    frames.append(frame)
+            except ValueError as error:
+                damage.add(f"line {number}", f"{error}: {shown(line.strip()[:60])}")
+        if damage.count and not frames and not parts:
+            raise InputError(f"{damage.path}, {damage.place}: cannot be read as {name}: {damage.reason}")
+        parts.append(FrameColumns.of(frames))
     return timed(FrameColumns.concatenate(parts), damage)
 
 
@@ -117,8 +107,6 @@ CANDUMP_LINE = re.compile(
     r"\s+\[(?P<length>\d{1,2})\](?:\s+(?P<remote>remote request)|(?P<spaced>(?:\s*[0-9A-Fa-f]{2})*))"
     r"\s*(?:'.*'|ERRORFRAME)?)"
 )
-_SCALE = {digits + 1: 10 ** (9 - digits) for digits in range(1, 10)}
-"""Length of the fraction with the closing bracket -> ns in a unit of its last digit."""
 _EIGHT_BYTES = 16  # digits
 
 
@@ -135,55 +123,26 @@ class _Identifiers(dict[str, int]):
         return value
 
 
-class _CandumpParser:
-    """Parses lines of one log."""
+def read_candump(data: Contents, damage: LogDamage) -> FrameColumns:
+    """Read the frames of a candump log, whose dates are UTC; lines that are none are noted as damage."""
+    identifiers, channels = _Identifiers(), ChannelNumbers()
 
-    def __init__(self) -> None:
-        self._identifiers, self._channels = _Identifiers(), ChannelNumbers()
-
-    def many(self, text: str) -> list[Frame] | None:
-        """The frames of whole lines of ``candump -L``; None if any line is out of the ordinary."""
-        if text.endswith(" R\n"):  # "received": the ordinary case of the logs that tell the direction
-            text = text.replace(" R\n", "\n")
-        tokens = text.split()
-        lines = len(tokens) // 3
-        # As many brackets, line ends and triples of words: every line is of the ordinary form, or int() below fails.
-        if 3 * lines != len(tokens) or not lines == text.count("(") == text.count(")") == text.count("\n"):
-            return None
-        frames: list[Frame] = []
-        append, scale, unhex = frames.append, _SCALE, bytes.fromhex
-        identifiers, channels = self._identifiers, self._channels
-        try:
-            for stamp, name, frame in zip(tokens[0::3], tokens[1::3], tokens[2::3], strict=True):
-                seconds, _, fraction = stamp.partition(".")
-                identifier, _, digits = frame.partition("#")
-                if len(digits) > _EIGHT_BYTES:
-                    return None
-                time_ns = int(seconds[1:]) * 1_000_000_000 + int(fraction[:-1]) * scale[len(fraction)]
-                append((time_ns, identifiers[identifier], unhex(digits), channels[name]))
-        except (ValueError, LookupError):
-            return None
-        return frames
-
-    def one(self, line: str) -> Frame | None:
-        """The frame of a line of any form; a date is taken as UTC."""
+    def parse(line: str) -> Frame | None:
         if line.startswith("\t"):  # explains the error frame above it
             return None
         if not (match := CANDUMP_LINE.fullmatch(line.strip())):
             raise ValueError("not a line of a candump log")
         if not line.endswith("\n") and match["length"] is None and len(match["data"] or "") < _EIGHT_BYTES:
             raise ValueError("the last line has no end, so data may be missing")
-        identifier, data = (
-            self._identifiers[match["id"]],
-            bytes.fromhex(match["fd"] or match["data"] or match["spaced"] or ""),
-        )
+        identifier = identifiers[match["id"]]
+        data = bytes.fromhex(match["fd"] or match["data"] or match["spaced"] or "")
         length = int(match["length"] or match["asked"] or len(data))
         if match["remote"] or match["asked"] is not None:
             identifier |= RTR_FLAG
             data = bytes(min(length, 8))
         elif len(data) != length:
             raise ValueError(f"{len(data)} bytes where there should be {length}")
-        time_ns, stamp, channel = 0, match["stamp"], self._channels[match["channel"]]
+        time_ns, stamp, channel = 0, match["stamp"], channels[match["channel"]]
         if stamp and "-" in stamp[1:]:
             since = datetime.fromisoformat(stamp).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
             time_ns = since // timedelta(microseconds=1) * 1000
@@ -192,11 +151,7 @@ class _CandumpParser:
         sent = (match["screen"] or match["log"] or "R").upper() == "T"
         return time_ns, identifier, data, channel | (TRANSMITTED if sent else 0)
 
-
-def read_candump(data: Contents, damage: LogDamage) -> FrameColumns:
-    """Read the frames of a candump log; lines that are none are noted as damage."""
-    parser = _CandumpParser()
-    return read_lines(data, damage, parser.one, "a candump log", parser.many)
+    return read_lines(data, damage, parse, "a candump log")
 
 
 # --- SavvyCAN -----------------------------------------------------------------------------------------------------
