@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _rider(text: str) -> str:
-    if not 1 <= len(text) <= (most := CONSUMPTION.most_name_letters):
+    if not 1 <= len(text) <= (most := CONSUMPTION.max_name_letters):
         raise argparse.ArgumentTypeError(f"must be a name of 1 to {most} letters, is {shown(text)}")
     return text
 

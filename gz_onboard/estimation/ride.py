@@ -261,9 +261,9 @@ def state_for(file: Path, ride: OpenRide, facts: Mapping[str, object]) -> RideSt
             "their order and what passed between them"
         )
     rider = str(facts.get("rider", ""))
-    if len(rider) > CONSUMPTION.most_name_letters:
+    if len(rider) > CONSUMPTION.max_name_letters:
         raise InputError(
-            f"{ride.source}: rides.json: rider {rider!r}: must have at most {CONSUMPTION.most_name_letters} letters"
+            f"{ride.source}: rides.json: rider {rider!r}: must have at most {CONSUMPTION.max_name_letters} letters"
         )
     return RideState(file, codec.time_ns(0.0), codec.last_ns, rider)
 

@@ -73,12 +73,12 @@ def condition(
     slopes: tuple[float, float, float],
     residual: float,
     variance: float,
-    least_capacity_variance: float,
+    min_capacity_variance: float,
 ) -> FilterState:
     """Condition the state on a scalar measurement.
 
     slopes: derivatives of the measurement over (soc, error, resistance); residual: measured minus predicted; variance:
-    of the measurement's noise. The variance of the inverse capacity stays at `least_capacity_variance` or more, and its
+    of the measurement's noise. The variance of the inverse capacity stays at `min_capacity_variance` or more, and its
     gain is reduced to match (a partial update: Brink 2017); infinity leaves the capacity as it is.
     """
     hz, he, hr = slopes
@@ -87,8 +87,8 @@ def condition(
     c, r = hz * zc + he * ec + hr * cr, hz * zr + he * er + hr * rr
     total = hz * z + he * e + hr * r + variance
     kz, ke, kc, kr = z / total, e / total, c / total, r / total
-    told = kc * c
-    share = min(max(cc - least_capacity_variance, 0.0) / told, 1.0) if told > 0 else 0.0
+    reduction = kc * c  # of the variance of the inverse capacity
+    share = min(max(cc - min_capacity_variance, 0.0) / reduction, 1.0) if reduction > 0 else 0.0
     covariance = (
         zz - kz * z,
         ze - kz * e,
@@ -97,7 +97,7 @@ def condition(
         ee - ke * e,
         ec - ke * c,
         er - ke * r,
-        cc - share * told,
+        cc - share * reduction,
         cr - kc * r,
         rr - kr * r,
     )

@@ -349,7 +349,7 @@ class BatteryPack:
         source = reading.source if signals.sampled <= TIMING.slowest else CurrentSource.NONE
         period = signals.sampled if signals.sampled > TIMING.coarse else 0.0
         variance = self._charge_noise.counted(
-            min(dt, signals.pause), flowed, charge, source, reading.current_apart, period
+            min(dt, signals.pause), flowed, charge, source, reading.current_difference, period
         )
         zz = state.covariance[0]
         if dt > signals.pause or (source is CurrentSource.NONE and reading.unmeasured):
@@ -393,8 +393,8 @@ class BatteryPack:
         shown, current = battery.cell_voltage(voltage, pack_current), pack_current / battery.cells_parallel
         drop = cell.r0 * current + effects.overpotential
         self._follow_sag(dt, voltage, pack_current, reading)
-        self.state = state = self.age.permit(now, reading, self._signals, self.state)
-        if replaced := self.age.another_pack(state):
+        self.state = state = self.age.allow_learning(now, reading, self._signals, self.state)
+        if replaced := self.age.replaced_pack(state):
             self.state = state = replaced
             self.weakest.forget()
         if dt <= self._signals.pause and self._take_rest(dt, shown, current, reading, temperature):
@@ -452,7 +452,7 @@ class BatteryPack:
             return False
         residual = battery.soc_at(emf, temperature) - state.soc
         soc_variance = (soc_width(battery, emf, sqrt(new), temperature) / 2) ** 2
-        least = self.age.least_variance(state, state.soc, cell.slope)
+        least = self.age.min_capacity_variance(state, state.soc, cell.slope)
         state = self._backend.condition(state, (1.0, 0.0, 0.0), residual, soc_variance, least)
         self.state = state = bounded(state)
         self._cell = Cell.of(battery, state.soc, temperature)
@@ -465,7 +465,7 @@ class BatteryPack:
         """
         state, cell = self.state, self._cell
         at = state.soc
-        least = self.age.least_variance(state, at, cell.slope)
+        least = self.age.min_capacity_variance(state, at, cell.slope)
         for _ in range(PACK.turns):
             h = cell.slope - current * cell.r0_slope
             residual = emf - cell.ocv + cell.r0 * current - h * (state.soc - at) + state.error
@@ -500,7 +500,7 @@ class BatteryPack:
         self.past, self.past_age, self._unseen = past, age, STOOD
         self._rest = RestDetector()
         if not past:
-            self.age.forget_places()
+            self.age.reset_voltage_span()
 
     def _follow_gap(self, now: float, dt: float, reading: PackReading, temperature: float, price: float | None) -> None:
         """Start from the state before a gap if it was as long as a restart's: the pack may have been charged meanwhile.
@@ -598,7 +598,7 @@ class BatteryPack:
             past,
             self.past_age,
             vehicle,
-            lambda soc: self.age.least_variance(self.state, soc, battery.ocv(soc)[1]),
+            lambda soc: self.age.min_capacity_variance(self.state, soc, battery.ocv(soc)[1]),
         )
         self.state, self.is_started, self.past, self.past_age = state, True, None, None
         self.age.apply(state)

@@ -271,12 +271,12 @@ def first_state(
     past: Past | None,
     age: float | None,
     now: Past,
-    least_variance: Callable[[float], float],
+    min_capacity_variance: Callable[[float], float],
 ) -> FilterState:
     """The first state, from a voltage and from the state that was `believed` before.
 
     past: the vehicle `age` [s] ago, when the state was believed; None: nothing is believed of the SOC. now: the vehicle
-    at present. least_variance: of the inverse capacity, over SOC, see `condition`.
+    at present. min_capacity_variance: of the inverse capacity, over SOC, see `condition`.
     """
     temperature, current = first.temperature, first.current / battery.cells_parallel
     voltage = battery.cell_voltage(first.voltage, first.current) + first.overpotential
@@ -317,4 +317,4 @@ def first_state(
     state = FilterState(soc, 0.0, believed.inverse_capacity, believed.resistance, prior, v1)
     chord = shown_sd / sd  # SOC per volt
     slopes, seen_variance = (1.0, -chord, 0.0), (chord * once_sd) ** 2 + doubt
-    return bounded(condition(state, slopes, shown - soc, seen_variance, least_variance(shown)))
+    return bounded(condition(state, slopes, shown - soc, seen_variance, min_capacity_variance(shown)))

@@ -50,10 +50,10 @@ class ConsumptionConfig:
     fade_m: float = 50_000.0  # correlation length of a ride's deviation: 25 to 100 km err alike on 15 full discharges
     walk_per_sqrt_m: float = 2.2e-4  # random walk of the level: a tenth in 200 km (tyres, clothes, seasons)
     ride_share: float = 0.1  # weight of one ride in the variance from ride to ride: about the last ten count
-    least_sd: float = 0.005  # no riding is more even
+    min_sd: float = 0.005  # no riding is more even
     outlier_sd: float = 4.0  # a segment that differs by more is a faulty sensor or a wait for a ferry, and is clipped
     most: float = 10.0  # of any quantity; all are about 1, and a heated van in a jam takes 5 times the modelled energy
-    most_variance: float = 4.0
+    max_variance: float = 4.0
     doubt: float = 1.25  # sd over the change that a faulty sensor taught: price and stops may err alike
     # Priors: sd of the level, from ride to ride, and of a segment
     level_sd: float = 0.15  # price of riders and roads of one kind of vehicle
@@ -62,7 +62,7 @@ class ConsumptionConfig:
     pace_sd: tuple[float, float, float] = (0.25, 0.1, 0.4)
     factor_sd: tuple[float, float] = (0.03, 0.18)  # wind, tyres, luggage; a segment's, of eight commissioning rides
     # Forecast of the riding
-    least_price: float = 0.2  # of the prior riding: no riding of any length consumes less
+    min_price: float = 0.2  # of the prior riding: no riding of any length consumes less
     form_factor_squared: float = 2.5  # mean square of the power over its mean squared, of eight commissioning rides
     form_factor_squared_limits: tuple[float, float] = (1.0, 6.0)  # the same, of any riding
     height_walk: float = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km, where no sensor shows the grade
@@ -74,8 +74,8 @@ class ConsumptionConfig:
     # Auxiliaries
     auxiliary_mean_s: float = 180.0  # thermostats switch within this
     # Riders
-    most_riders: int = 50
-    most_name_letters: int = 40
+    max_riders: int = 50
+    max_name_letters: int = 40
 
 
 CONSUMPTION = ConsumptionConfig()
@@ -117,7 +117,7 @@ class LearnedQuantity(NamedTuple):
         c = CONSUMPTION
         fade = exp(-distance / c.fade_m)
         walk = (c.walk_per_sqrt_m * self.level) ** 2 * distance
-        level = min(self.level_variance + walk, max(self.level_variance, c.most_variance))
+        level = min(self.level_variance + walk, max(self.level_variance, c.max_variance))
         both = fade * self.covariance
         own = fade * fade * self.deviation_variance + (1 - fade * fade) * self.ride_variance
         scatter = self.scatter * c.segment_m / distance
@@ -153,13 +153,13 @@ class LearnedQuantity(NamedTuple):
         c = CONSUMPTION
         seen = self.deviation**2 + self.deviation_variance
         ride_variance = self.ride_variance + c.ride_share * (seen - self.ride_variance)
-        ride_variance = min(max(ride_variance, c.least_sd**2), c.most_variance)
+        ride_variance = min(max(ride_variance, c.min_sd**2), c.max_variance)
         return LearnedQuantity(self.level, self.level_variance, ride_variance, self.scatter, 0.0, ride_variance)
 
     def doubted(self, seen: float) -> LearnedQuantity:
         """State with a wider deviation, as it may be `seen` all the same, which a sensor in doubt has shown."""
         more = self.deviation_variance + (CONSUMPTION.doubt * (seen - self.now)) ** 2
-        return self._replace(deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.most_variance)))
+        return self._replace(deviation_variance=min(more, max(self.deviation_variance, CONSUMPTION.max_variance)))
 
 
 class Habits(NamedTuple):
@@ -174,7 +174,7 @@ class Habits(NamedTuple):
     def before(cls, prior: PriorRiding, stops: float) -> Habits:
         """Before anything is ridden; stops: of the prior riding."""
         c = CONSUMPTION
-        price_sd = sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, max(c.price_scatter * prior.drift, c.least_sd)
+        price_sd = sqrt(prior.factor_sd**2 + c.level_sd**2), prior.drift, max(c.price_scatter * prior.drift, c.min_sd)
         levels = prior.factor, stops, 1.0, prior.factor
         sds = price_sd, c.stops_sd, c.pace_sd, (prior.factor_sd, *c.factor_sd)
         return cls(
@@ -350,7 +350,7 @@ class ConsumptionLearner:
     @property
     def auxiliary_factor(self) -> float:
         """Increase of the consumption factor by auxiliaries beyond the file's, at the pace of the present riding."""
-        least, speed = CONSUMPTION.least_price, self.load.prior.speed
+        least, speed = CONSUMPTION.min_price, self.load.prior.speed
         modelled = self.prior_price * max(self.state.habits.price.now, least) / self.factor  # J/m
         return self.auxiliaries.mean / speed * max(self.state.habits.pace.now, least) / modelled
 
@@ -366,9 +366,9 @@ class ConsumptionLearner:
         price, price_variance = habits.price.ahead(way)
         stops, stops_variance = habits.stops.ahead(way)
         pace, pace_variance = habits.pace.ahead(way)
-        price, pace = max(price, c.least_price), max(pace, c.least_price)
+        price, pace = max(price, c.min_price), max(pace, c.min_price)
         extra = self.auxiliaries.mean / speed  # J/m, at the prior's pace
-        consumption = max(unit * (price + max(stops, 0.0)) + extra * pace, c.least_price * unit)
+        consumption = max(unit * (price + max(stops, 0.0)) + extra * pace, c.min_price * unit)
         # Where no grade was seen the price is the model's times the factor, whose error is the same all the way.
         unseen = sums.unseen / sums.distance if sums.distance else 0.0
         price_variance += (unseen * price / self.factor) ** 2 * habits.factor.variance
@@ -376,7 +376,7 @@ class ConsumptionLearner:
         prior_power, prior_time = (unit + standing) * speed, c.prior_m / speed
         # Downhill next to nothing is drawn in the mean; the way to come is not all downhill.
         energy = prior_power * prior_time + max(sums.energy, self.consumption_factor * sums.level)
-        energy = max(energy, c.least_price * prior_power * prior_time)
+        energy = max(energy, c.min_price * prior_power * prior_time)
         squares = c.form_factor_squared * prior_power**2 * prior_time + sums.squares
         low, high = c.form_factor_squared_limits
         variance = ((price_variance + stops_variance) * unit**2 + pace_variance * extra**2) / consumption**2
@@ -387,7 +387,7 @@ class ConsumptionLearner:
             consumption * speed / pace,
             min(max(squares * (prior_time + sums.duration) / energy**2, low), high),
             variance + height_variance,
-            c.least_price * unit,
+            c.min_price * unit,
             None if ridden < c.recent_m / 2 else (recent.energy + now.energy) / lately,
             ridden < c.prior_m,
         )
@@ -470,7 +470,7 @@ class ConsumptionLearner:
         paid = (1 - unseen) * (segment.measured - segment.modelled) + (1 - unseen + unseen * factor) * segment.level
         # The factor's residual is weighted by the energy to expect, not by the segment's modelled one: its errors (of
         # the grade) would draw the factor to 0. Hills that no sensor showed have stored an unknown energy.
-        weight = factor / (max(habits.price.now, c.least_price) * unit)
+        weight = factor / (max(habits.price.now, c.min_price) * unit)
         height = self._weight * c.height_walk * sqrt(segment.unseen)  # J
         learned = Habits(
             habits.price.learned(paid / unit - habits.price.now, way),
@@ -515,7 +515,7 @@ class ConsumptionLearner:
                 for x in (before.price, before.pace)
             )
             habits = before._replace(price=price, pace=pace)
-            if len(self.other_riders) > CONSUMPTION.most_riders:
+            if len(self.other_riders) > CONSUMPTION.max_riders:
                 del self.other_riders[next(iter(self.other_riders))]
         self.rider, self._segment = rider, Segment()
         self._history.clear()
@@ -601,8 +601,8 @@ FIELDS = {  # of the saved state
         "recent": _SUMS,
         "terrain": dict.fromkeys(Terrain._fields, _POSITIVE) | {"climb": _ANY},
     },
-    "rider": Text(CONSUMPTION.most_name_letters),
-    "riders": Each(_HABITS, CONSUMPTION.most_riders),
+    "rider": Text(CONSUMPTION.max_name_letters),
+    "riders": Each(_HABITS, CONSUMPTION.max_riders),
     "auxiliary_power": Number(-1e5, 1e5),  # W
     "effects": Each(FINITE, 100),
     "still": Number(0.0, 1e10),  # s

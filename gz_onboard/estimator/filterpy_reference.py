@@ -43,16 +43,16 @@ def condition(
     slopes: tuple[float, float, float],
     residual: float,
     variance: float,
-    least_capacity_variance: float,
+    min_capacity_variance: float,
 ) -> FilterState:
     """See `battery_filter.condition`."""
     ekf, h = _filter_of(state), np.array([[slopes[0], slopes[1], 0.0, slopes[2]]])
     measured = h @ ekf.x + residual
     ekf.update(measured, lambda x: h, lambda x: h @ x, R=variance)
-    before, told = state.covariance[7], state.covariance[7] - ekf.P[2, 2]
-    share = min(max(before - least_capacity_variance, 0.0) / told, 1.0) if told > 0 else 0.0
+    before, reduction = state.covariance[7], state.covariance[7] - ekf.P[2, 2]
+    share = min(max(before - min_capacity_variance, 0.0) / reduction, 1.0) if reduction > 0 else 0.0
     ekf.x[2, 0] = state.inverse_capacity + share * (ekf.x[2, 0] - state.inverse_capacity)
-    ekf.P[2, 2] = before - share * told
+    ekf.P[2, 2] = before - share * reduction
     return _state_of(ekf, state.v1)
 
 

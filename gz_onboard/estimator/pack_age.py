@@ -37,7 +37,7 @@ class AgeConfig:
     aged_resistance_sd: float = 0.42  # of the same packs
     aged_correlation: float = 0.8  # of the two: cells of one kind that were aged in many ways
     least_new_sd: float = 0.003  # of a pack that is as new: no capacity is known more closely
-    least_variance: float = 0.01**2  # of the inverse capacity: an ageing cell differs in more than its capacity
+    min_capacity_variance: float = 0.01**2  # of the inverse capacity: an ageing cell differs in more than its capacity
     capacity_walk: float = 0.02**2 / 100  # variance that the inverse capacity gains over a whole charge
     resistance_walk: float = 0.03**2  # variance of the resistance over a whole charge: temperature, place on the curve
     quick_noise: float = 0.0035  # V²·s of a cell: quick changes without the load's, 10 mV that stay for 18 s
@@ -45,7 +45,7 @@ class AgeConfig:
     proven_s: float = 150.0  # of load
     kept: int = 5  # times in it that the resistance is kept
     applied_every_s: float = 10.0
-    another_pack: float = 1.4  # ratio of resistances: one pack spans up to 1.38 from frost to 43 degC
+    replaced_pack: float = 1.4  # ratio of resistances: one pack spans up to 1.38 from frost to 43 degC
     agreeing_rate: float = 0.01  # 1/h: two currents that differ by more in the mean show no capacity
     doubted_from: float = 0.05  # of SOC: over less charge no capacity makes a voltage wrong
 
@@ -94,14 +94,14 @@ def believe(as_new: float, new_sd: float, state: FilterState, resistance: float,
     makes no pack better than new.
     """
     zc, cc = state.covariance[2], state.covariance[7]
-    told = max(1 / cc - 1 / mixture_variance(as_new, new_sd), 0.0)  # information beyond the prior's
-    off, old_sd = (state.inverse_capacity - 1) / cc, AGE.aged_capacity_sd
+    precision = max(1 / cc - 1 / mixture_variance(as_new, new_sd), 0.0)  # information beyond the prior's
+    weighted, old_sd = (state.inverse_capacity - 1) / cc, AGE.aged_capacity_sd
     more, aged = max(resistance - 1, 0.0), AGE.aged_resistance_sd**2 + resistance_variance
     gain = AGE.aged_correlation * old_sd * AGE.aged_resistance_sd / aged
     odds = log(as_new / (1 - as_new)) + log(aged / resistance_variance) / 2
     odds += more * more * (1 / aged - 1 / resistance_variance) / 2
-    new, new_evidence = _posterior(0.0, new_sd**2, told, off)
-    old, old_evidence = _posterior(gain * more, old_sd**2 - gain * gain * aged, told, off)
+    new, new_evidence = _posterior(0.0, new_sd**2, precision, weighted)
+    old, old_evidence = _posterior(gain * more, old_sd**2 - gain * gain * aged, precision, weighted)
     share = 1 / (1 + exp(min(max(old_evidence - new_evidence - odds, -50.0), 50.0)))
     kinds = (share, *new), (1 - share, *old)
     lowest, highest = PRIOR.inverse_capacity_bounds
@@ -113,11 +113,13 @@ def believe(as_new: float, new_sd: float, state: FilterState, resistance: float,
     return Belief(1 + mean, variance, shift, moves * moves * (variance - cc), low, high)
 
 
-def _posterior(mean: float, variance: float, told: float, off: float) -> tuple[tuple[float, float], float]:
-    """((mean, sd), logarithm of the evidence) of a normal prior and the likelihood exp(off·x - told·x²/2)."""
-    wide = 1 + variance * told
-    evidence = (2 * mean * off + variance * off * off - mean * mean * told) / (2 * wide) - log(wide) / 2
-    return ((mean + variance * off) / wide, sqrt(variance / wide)), evidence
+def _posterior(mean: float, variance: float, precision: float, weighted: float) -> tuple[tuple[float, float], float]:
+    """((mean, sd), logarithm of the evidence) of a normal prior and the likelihood exp(weighted·x - precision·x²/2)."""
+    wide = 1 + variance * precision
+    evidence = (2 * mean * weighted + variance * weighted * weighted - mean * mean * precision) / (2 * wide) - log(
+        wide
+    ) / 2
+    return ((mean + variance * weighted) / wide, sqrt(variance / wide)), evidence
 
 
 def _quantile(share: float, kinds: tuple[tuple[float, float, float], ...]) -> float:
@@ -141,7 +143,7 @@ class PackAge:
         covariance = (PRIOR.unknown_soc_sd**2, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, self._unknown, 0.0)
         self.unknown = FilterState(0.5, 0.0, 1.0, 1.0, (*covariance, AGE.aged_resistance_sd**2))
         self.is_learning = False
-        self.forget_places()
+        self.reset_voltage_span()
         self._agreeing = AGE.agreeing_rate * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
         self._since = 0.0  # s, since the belief was applied
@@ -160,9 +162,9 @@ class PackAge:
     def apply(self, state: FilterState) -> None:
         """Form the belief."""
         factor, variance = self._proven[0]
-        told = max(1 / variance - 1 / AGE.aged_resistance_sd**2, 1e-9)
+        precision = max(1 / variance - 1 / AGE.aged_resistance_sd**2, 1e-9)
         by_table = max(PRIOR.resistance_sd, self._battery.resistance_sd) ** 2
-        self.belief = believe(self._battery.as_new, self._new_sd, state, factor, 1 / told + by_table)
+        self.belief = believe(self._battery.as_new, self._new_sd, state, factor, 1 / precision + by_table)
         change = factor - 1
         # A change that is small against the tables' own error is mostly that error (a Wiener filter).
         resistance = 1 + change**3 / (change**2 + PRIOR.resistance_sd**2)
@@ -206,42 +208,42 @@ class PackAge:
 
     # --- learning ---------------------------------------------------------------------------------------------
 
-    def separate(self, state: FilterState) -> FilterState:
+    def reset_cross_covariance(self, state: FilterState) -> FilterState:
         """Take SOC as it is believed; its error is no longer that of the charge counted so far."""
         soc, sd = self.published(state)
         state = with_soc(state, soc, sd * sd)
-        self.forget_places()
+        self.reset_voltage_span()
         self.apply(state)
         return state
 
-    def forget_places(self) -> None:
+    def reset_voltage_span(self) -> None:
         """Forget between which places on the curve charge was counted."""
-        self._seen = 2.0, -1.0  # lowest and highest SOC at which voltages were used
+        self._voltage_span = 2.0, -1.0  # lowest and highest SOC at which voltages were used
 
-    def permit(self, now: float, reading: PackReading, signals: Signals, state: FilterState) -> FilterState:
+    def allow_learning(self, now: float, reading: PackReading, signals: Signals, state: FilterState) -> FilterState:
         """Learn only while all that it depends on is beyond doubt: otherwise a sensor's fault would be learned."""
         zz, _, zc, _, _, _, _, cc, _, _ = state.covariance
         by_itself = zz - zc * zc / cc
         sound = reading.source is CurrentSource.PACK and not reading.voltage_doubted
         known = signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
-        agree = reading.current_apart is None or abs(reading.current_apart) < self._agreeing
+        agree = reading.current_difference is None or abs(reading.current_difference) < self._agreeing
         permitted = sound and known and agree and by_itself < PRIOR.trusted_soc_sd**2
         if permitted == self.is_learning:
             return state
         self.is_learning = permitted
-        return self.separate(state)
+        return self.reset_cross_covariance(state)
 
-    def least_variance(self, state: FilterState, soc: float, slope: float) -> float:
+    def min_capacity_variance(self, state: FilterState, soc: float, slope: float) -> float:
         """Variance of the inverse capacity below which a voltage at `soc` tells nothing; slope: of the curve [V].
 
         The curve errs the same way each time: between two places on it no number of cycles tells more than that.
         """
         if not self.is_learning:
             return float("inf")
-        self._seen = min(self._seen[0], soc), max(self._seen[1], soc)
+        self._voltage_span = min(self._voltage_span[0], soc), max(self._voltage_span[1], soc)
         counted = abs(state.covariance[2]) / state.covariance[7]
-        span = max(self._seen[1] - self._seen[0], counted, 1e-3)
-        return AGE.least_variance + 2 * (self._battery.ocv_sd / slope / span) ** 2
+        span = max(self._voltage_span[1] - self._voltage_span[0], counted, 1e-3)
+        return AGE.min_capacity_variance + 2 * (self._battery.ocv_sd / slope / span) ** 2
 
     def load(self, state: FilterState, dt: float, drop: float, error: float) -> FilterState:
         """Learn the resistance over `dt` [s] from the `drop` predicted and the `error` measured minus predicted [V]."""
@@ -264,7 +266,7 @@ class PackAge:
             self._proven.append((state.resistance, state.covariance[9]))
         return state
 
-    def another_pack(self, state: FilterState) -> FilterState | None:
+    def replaced_pack(self, state: FilterState) -> FilterState | None:
         """Compare the resistance of this ride once with that of the rides before; the state of a replaced pack, if so.
 
         A pack with more resistance than before is no newer: its capacity is known half as well as that of any pack. So
@@ -277,9 +279,9 @@ class PackAge:
         low, high = PRIOR.resistance_bounds
         resistance = min(max(product / square, low), high)
         ratio = resistance / self._before[0]
-        if self._before[1] > table or 1 / AGE.another_pack < ratio < AGE.another_pack:
+        if self._before[1] > table or 1 / AGE.replaced_pack < ratio < AGE.replaced_pack:
             return None
-        state = self.separate(state)
+        state = self.reset_cross_covariance(state)
         inverse, variance = (1.0, self._unknown) if ratio < 1 else (state.inverse_capacity, self._unknown / 2)
         zz, ze, _, _, ee, _, _, cc, _, _ = state.covariance
         covariance = (zz, ze, 0.0, 0.0, ee, 0.0, 0.0, max(cc, variance), 0.0, AGE.quick_noise / square)

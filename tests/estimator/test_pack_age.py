@@ -75,12 +75,12 @@ def discharge(
         charge = current * DT / 3600 / (PACK.capacity * PACK.capacity_share.at(WARM))
         noise = Noise(1e-10, ERROR_VARIANCE, math.exp(-DT / ERROR_TIME), AGE.capacity_walk * charge, 0.0)
         state = predict(state, charge, advanced(battery, DT, state.soc, state.v1, current, WARM)[1], noise)
-        state = age.permit(now, reading, signals, state)
-        state = age.another_pack(state) or state
+        state = age.allow_learning(now, reading, signals, state)
+        state = age.replaced_pack(state) or state
         predicted = cell_voltage(battery, state.soc, state.v1, current, WARM)
         h = battery.ocv(state.soc)[1] - current * battery.r0.at(state.soc, WARM)[1]
         error, drop = voltage - predicted, battery.r0.at(state.soc, WARM)[0] * current + state.v1
-        least = age.least_variance(state, state.soc, battery.ocv(state.soc)[1])
+        least = age.min_capacity_variance(state, state.soc, battery.ocv(state.soc)[1])
         state = condition(state, (h, -1.0, 0.0), error + state.error, 0.005**2 * 2 * ERROR_TIME, least)
         state = age.load(bounded(state), DT, drop, error)
         age.follow(state, DT)
@@ -106,7 +106,7 @@ def test_half_a_discharge_shows_capacity_and_resistance(capacity: float, resista
         SOUND._replace(source=CurrentSource.INVERTER),
         SOUND._replace(source=CurrentSource.DISPUTED),
         SOUND._replace(voltage_doubted=True),
-        SOUND._replace(current_apart=2.0),
+        SOUND._replace(current_difference=2.0),
     ],
 )
 def test_a_doubted_sensor_is_not_explained_as_age(reading: PackReading):

@@ -55,9 +55,9 @@ def test_who_never_rode_is_taken_for_the_one_before_but_less_surely():
 
 def test_riders_do_not_fill_the_state():
     f = forecaster()
-    for number in range(3 * CONSUMPTION.most_riders):
+    for number in range(3 * CONSUMPTION.max_riders):
         f.ridden_by(str(number))
-    assert len(f.learner.other_riders) <= CONSUMPTION.most_riders
+    assert len(f.learner.other_riders) <= CONSUMPTION.max_riders
     forecaster().restore(json.loads(json.dumps(f.snapshot())))
 
 

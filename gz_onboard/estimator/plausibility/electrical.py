@@ -46,7 +46,7 @@ class PackReading(NamedTuple):
     source: CurrentSource = CurrentSource.NONE
     reported_current: float | None = None  # A, trusted or not
     voltage_sd: float = 0.0  # V of a cell
-    current_apart: float | None = None  # A: mean difference of the two currents; None: only one is known
+    current_difference: float | None = None  # A: mean difference of the two currents; None: only one is known
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
 
     @property

@@ -34,17 +34,18 @@ LevelPower = Callable[[float, float], float]
 
 
 def vote(
-    speeds: Mapping[str, float], apart: Mapping[str, float], spins: bool = True
+    speeds: Mapping[str, float], tolerance: Mapping[str, float], spins: bool = True
 ) -> tuple[frozenset[str], frozenset[str]]:
     """Find the majority: (outvoted roles, roles that contradict each other with nothing to decide).
 
-    speeds [m/s] by role; apart: the most [m/s] by which each may differ from another. spins: a driven axle that
+    speeds [m/s] by role; tolerance: the most [m/s] by which each may differ from another. spins: a driven axle that
     contradicts the ground may be wheelspin, no fault; otherwise it counts as one witness, scaled by one wheel radius.
     """
-    if max(speeds.values()) - min(speeds.values()) <= min(apart.values()):
+    if max(speeds.values()) - min(speeds.values()) <= min(tolerance.values()):
         return NO_SENSOR, NO_SENSOR
     groups = {
-        frozenset(b for b, w in speeds.items() if abs(v - w) <= max(apart[a], apart[b])) for a, v in speeds.items()
+        frozenset(b for b, w in speeds.items() if abs(v - w) <= max(tolerance[a], tolerance[b]))
+        for a, v in speeds.items()
     }
     everyone = frozenset(speeds)
     if everyone in groups:
@@ -89,7 +90,7 @@ class SpeedCheck:
         fix = not signals.fix_below(now, FIX_2D)
         signals.gps_speed.trusted = signals.gps_course.trusted = fix
         speeds: dict[str, float] = {}  # m/s
-        apart: dict[str, float] = {}  # m/s, the most by which each may differ from another
+        tolerance: dict[str, float] = {}  # m/s, the most by which each may differ from another
         for sensor in self._speeds:
             role, reported = sensor.role, sensor.signal.reported
             if reported is None or (role == "gps_speed" and not fix):
@@ -98,41 +99,41 @@ class SpeedCheck:
             sensor.time_unchanged(dt, speed)
             speeds[role] = speed if speed < -CONFIG.reverse_m_s else abs(speed)
             usual = CONFIG.speed_sd_m_s + CONFIG.speed_sd_relative * abs(speed)
-            apart[role] = usual + CONFIG.hardest_m_s2 * max(now - sensor.signal.time, 0.0)
+            tolerance[role] = usual + CONFIG.hardest_m_s2 * max(now - sensor.signal.time, 0.0)
         self.disputed = self.on_road = False
         believed = {role: speed for role, speed in speeds.items() if not self.sensors[role].faulty}
         self.roles = tuple(believed or speeds)
         ordered = sorted((believed or speeds).values())  # importing `statistics` would cost 6 ms at each start
         self.median = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2 if ordered else None
         if len(speeds) == 1:
-            self._test_alone(dt, speeds, gap)
+            self._test_single(dt, speeds, gap)
         else:
             self.odometer.restart(None)
             if speeds:
-                self._test_group(dt, speeds, apart, believed)
+                self._test_group(dt, speeds, tolerance, believed)
         self.disputed |= bool(speeds) and not believed
 
     def _test_group(
-        self, dt: float, speeds: dict[str, float], apart: dict[str, float], believed: dict[str, float]
+        self, dt: float, speeds: dict[str, float], tolerance: dict[str, float], believed: dict[str, float]
     ) -> None:
         middle, stuck_s = self.median or 0.0, CONFIG.brief_s
         moving = middle > CONFIG.moving_m_s
-        outvoted, tied = vote(speeds, apart, spins=False)
+        outvoted, tied = vote(speeds, tolerance, spins=False)
         if not outvoted | tied:
             self._spinning = max(self._spinning - dt, 0.0) if moving else self._spinning
-        elif not any(vote(speeds, apart)):  # the driven axle against the ground
+        elif not any(vote(speeds, tolerance)):  # the driven axle against the ground
             moving = min(speeds.values()) > CONFIG.moving_m_s  # else on a roller bench
             self._spinning = min(self._spinning + dt, 1.5 * CONFIG.wheelspin_s) if moving else self._spinning
             if self._spinning < CONFIG.wheelspin_s:
                 outvoted, tied, self.disputed = NO_SENSOR, NO_SENSOR, moving
         if tied:
             stuck = frozenset(role for role in tied if self.sensors[role].unchanged >= stuck_s)
-            if believed and believed != speeds and not any(vote(believed, apart, spins=False)):
+            if believed and believed != speeds and not any(vote(believed, tolerance, spins=False)):
                 outvoted, tied = tied - believed.keys(), NO_SENSOR  # the sensors found out before explain it
             elif stuck and stuck != tied:
                 outvoted, tied = stuck, NO_SENSOR
         self.disputed |= bool(tied)
-        ground = [abs(speeds[role] - middle) <= apart[role] for role in GROUND if role in speeds.keys() - outvoted]
+        ground = [abs(speeds[role] - middle) <= tolerance[role] for role in GROUND if role in speeds.keys() - outvoted]
         self.on_road = not tied and any(ground) and all(self.sensors[role].faulty for role in outvoted)
         for role in speeds:
             sensor = self.sensors[role]
@@ -140,7 +141,7 @@ class SpeedCheck:
             against = role in outvoted or role in tied
             sensor.judge(dt, True if against else False if comparable else None, role in tied)
 
-    def _test_alone(self, dt: float, speeds: Mapping[str, float], gap: bool) -> None:
+    def _test_single(self, dt: float, speeds: Mapping[str, float], gap: bool) -> None:
         """Compare the only speed with the odometer, which is no witness among others: it is often made from one."""
         ((role, speed),) = speeds.items()
         sensor = self.sensors[role]
