@@ -678,7 +678,7 @@ def calibrate(
     texts = [f"{name}={value}" for name, value in (options or {}).items()]
     base, steps = calibration.requested(procedure, files, texts, None if vehicle is None else _file(vehicle))
     found = calibration.run_steps(steps, base, progress or (lambda _: None))
-    return Calibration(base, [result for result, _ in found], calibration.files_of(steps, files.get("data", [])))
+    return Calibration(base, list(found), calibration.files_of(steps, files.get("data", [])))
 
 
 # --- discover -------------------------------------------------------------------------------------------------------

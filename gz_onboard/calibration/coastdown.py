@@ -21,10 +21,11 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, stretches
 from gz_onboard.calibration.fit import Solution, linear, score
 from gz_onboard.calibration.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.constants import GRAVITY
@@ -48,7 +49,7 @@ class CoastdownConfig:
     shortest: float = 10.0  # s
     least_fall: float = 3.0  # m/s
     driving: float = 0.01  # of the motor's greatest current, beside its offset: mean of a span of coasting
-    rising: float = 0.2  # m/s from one `rise_time` to the next
+    rising: float = 0.2  # m/s from one `rise_time` to the next: noise of a mean is less
     rise_time: float = 5.0  # s
     closed: float = 0.02  # of the throttle: below is noise
     wind_sd: float = 1.0  # m/s: a constant wind along the track on a day that was chosen for coast-downs
@@ -254,14 +255,13 @@ def coast(run: Recording, vehicle: Vehicle, direction: int) -> Coast:
 
 def _longest(rolling: Mask, time: Array) -> tuple[int, int]:
     """The longest stretch of `rolling` as (first, end), blinks of a tenth of a second passed over."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], rolling, [False])).astype(int)))
-    starts, ends = edges[::2], edges[1::2]
-    if not len(starts):
-        return 0, 0
-    apart = time[starts[1:]] - time[ends[:-1] - 1] >= 0.1
-    starts, ends = starts[np.append(True, apart)], ends[np.append(apart, True)]
-    best = int(np.argmax(time[ends - 1] - time[starts]))
-    return int(starts[best]), int(ends[best])
+    joined: list[tuple[int, int]] = []
+    for first, end in stretches(rolling):
+        if joined and time[first] - time[joined[-1][1] - 1] < 0.1:
+            joined[-1] = joined[-1][0], end
+        else:
+            joined.append((first, end))
+    return max(joined, key=lambda part: time[part[1] - 1] - time[part[0]], default=(0, 0))
 
 
 def _check_current(run: Recording, time: Array, driving: float) -> None:
@@ -283,22 +283,17 @@ def _check_current(run: Recording, time: Array, driving: float) -> None:
 
 
 def _check_falling(run: Recording, time: Array, speed: Array) -> None:
-    """Refuse a run whose mean speed rises from one `rise_time` to the next by more than its noise explains."""
-    step = COASTDOWN.rise_time
-    means, sds = [], []
-    for begin in time[0] + step * np.arange(max(int((time[-1] - time[0]) / step), 1)):
-        inside = (time >= begin) & (time < begin + step)
-        x, y = time[inside], speed[inside]
-        left = y - np.polyval(np.polyfit(x - begin, y, 1), x - begin) if len(x) > 2 else np.zeros(1)
-        means.append(float(y.mean()) if len(y) else float("nan"))
-        sds.append(float(np.sqrt(left @ left) / max(len(x) - 2, 1)))
-    rises = np.diff(means) - 3 * np.hypot(sds[1:], sds[:-1])
-    if len(rises) and np.nanmax(rises) > COASTDOWN.rising:
-        i = int(np.nanargmax(rises))
-        begin = time[0] + i * step - min(t[0] for t, _ in run.columns.values())
+    """Refuse a run whose mean speed rises from one `rise_time` to the next."""
+    number = np.floor((time - time[0]) / COASTDOWN.rise_time).astype(int)
+    means = np.bincount(number, speed) / np.maximum(np.bincount(number), 1)
+    means = means[np.bincount(number) > 0]
+    rises = np.diff(means)
+    if len(rises) and rises.max() > COASTDOWN.rising:
+        i = int(np.argmax(rises))
+        begin = time[0] + i * COASTDOWN.rise_time - min(t[0] for t, _ in run.columns.values())
         raise InputError(
             f"{run.name}: the speed rises from {means[i]:.2f} to {means[i + 1]:.2f} m/s between {begin:.0f} and "
-            f"{begin + 2 * step:.0f} s: the motor drives, or the track falls too steeply"
+            f"{begin + 2 * COASTDOWN.rise_time:.0f} s: the motor drives, or the track falls too steeply"
         )
 
 
@@ -306,11 +301,9 @@ def _at_ends(time: Array, speed: Array, ends: Array) -> Array:
     """The speed at `ends`: a straight line through the samples within a quarter of a second around each."""
     result = np.interp(ends, time, speed)
     for i, at in enumerate(ends):
-        a, b = np.searchsorted(time, [at - 0.25, at + 0.25])
-        if b - a >= 4:
-            x, y = time[a:b] - at, speed[a:b]
-            spread = x - x.mean()
-            result[i] = y.mean() - x.mean() * float(spread @ y) / float(spread @ spread)
+        near = slice(*np.searchsorted(time, [at - 0.25, at + 0.25]))
+        if len(time[near]) >= 4:
+            result[i] = np.polyfit(time[near] - at, speed[near], 1)[1]
     return result
 
 
@@ -374,18 +367,14 @@ class RoadLoad:
 
 
 def roll(force: RoadLoad, run: Coast, slope: float, wind: float) -> Array:
-    """Speed [m/s] at the run's times from its first speed on: Runge-Kutta of fourth order; zero after standstill."""
-    speed = np.empty(len(run.time))
-    speed[0] = v = float(run.speed[0])
-    for i, dt in enumerate(np.diff(run.time).tolist()):
-        if v > 0.05:
-            k1 = force.slowing(v, run, slope, wind)
-            k2 = force.slowing(max(v - dt / 2 * k1, 1e-3), run, slope, wind)
-            k3 = force.slowing(max(v - dt / 2 * k2, 1e-3), run, slope, wind)
-            k4 = force.slowing(max(v - dt * k3, 1e-3), run, slope, wind)
-            v = max(v - dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), 0.0)
-        speed[i + 1] = v
-    return speed
+    """Speed [m/s] at the run's times from its first speed on; zero after standstill."""
+
+    def acceleration(_: float, speed: Array) -> Any:
+        return -force.slowing(np.maximum(speed, 1e-3), run, slope, wind)
+
+    span, start = (run.time[0], run.time[-1]), run.speed[:1]
+    rolled = solve_ivp(acceleration, span, start, t_eval=run.time, rtol=1e-8)
+    return np.asarray(np.maximum(rolled.y[0], 0.0))
 
 
 # --- the fit -------------------------------------------------------------------------------------------------------

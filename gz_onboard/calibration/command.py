@@ -51,20 +51,20 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output:
         vehicle_output(arguments.output, read, "--output ")
     not_an_input((arguments.output, arguments.report, arguments.json), read)
-    found: list[tuple[Result, float]] = []
+    results: list[Result] = []
     trouble: InputError | None = None
     work = sum(len(files) for step in steps for files in step.files.values()) + len(steps)
     with progress_bar(lambda: work, "steps", quiet=arguments.quiet) as display:
         try:
-            for one in run_steps(steps, base, lambda text: display.step(text, 1)):
-                found.append(one)
+            for result in run_steps(steps, base, lambda text: display.step(text, 1)):
+                results.append(result)
         except InputError as error:
-            if not found:
+            if not results:
                 raise
             trouble = error  # what was found before is reported
-    results, text = [result for result, _ in found], arguments.json != "-"
-    for result, seconds in found if text else ():
-        print(f"{report.text(result)}\n  ({seconds:.1f} s)")
+    text = arguments.json != "-"
+    for result in results if text else ():
+        print(report.text(result))
     with writing(base):
         if arguments.output and not trouble:
             try:

@@ -182,22 +182,21 @@ def write_report(file: Path, title: str, results: Sequence[Result], trouble: Exc
 
 def _section(result: Result) -> str:
     parts = [f'<h2 id="{html.escape(result.procedure)}">{html.escape(result.procedure)}</h2>']
-    if result.parameters:
-        rows = [[name, plus_minus(f.value, f.sd), f.unit, f.source] for name, f in result.parameters.items()]
-        parts.append(html_table(["parameter", "value ± sd", "unit", "source"], rows, [1]))
-    if result.curves:
-        rows = [[name, shape(c), c.source] for name, c in result.curves.items()]
-        parts.append(html_table(["table", "values", "source"], rows, [0]))
-    if result.fits:
-        rows = []
-        for f in result.fits:
-            data, r2 = f"{f.data} ({'held out' if f.held_out else 'fitted'})", "" if f.r2 is None else f"{f.r2:.4f}"
-            rows.append([f.what, data, str(f.points), r2, f"{f.rms:.3g}", f"{f.largest:.3g}", f.unit])
-        parts.append(html_table(["fit", "data", "points", "R²", "rms", "largest", "unit"], rows, [2, 3, 4, 5]))
+    parameters = [[name, plus_minus(f.value, f.sd), f.unit, f.source] for name, f in result.parameters.items()]
+    curves = [[name, shape(c), c.source] for name, c in result.curves.items()]
+    fits = []
+    for f in result.fits:
+        data, r2 = f"{f.data} ({'held out' if f.held_out else 'fitted'})", "" if f.r2 is None else f"{f.r2:.4f}"
+        fits.append([f.what, data, str(f.points), r2, f"{f.rms:.3g}", f"{f.largest:.3g}", f.unit])
+    tables = [
+        (["parameter", "value ± sd", "unit", "source"], parameters, range(1, 2)),
+        (["table", "values", "source"], curves, range(1)),
+        (["fit", "data", "points", "R²", "rms", "largest", "unit"], fits, range(2, 6)),
+    ]
     for names, matrix in _correlations(result):
         rows = [[a, *(f"{matrix[i, j]:+.2f}" for j in range(i + 1))] for i, a in enumerate(names)]
-        if len(names) <= _MOST_TIED:
-            parts.append(html_table(["correlation", *names], rows, range(1, len(names) + 1)))
+        tables.append((["correlation", *names], rows if len(names) <= _MOST_TIED else [], range(1, len(names) + 1)))
+    parts += [html_table(heads, rows, numbers) for heads, rows, numbers in tables if rows]
     parts += [f'<p class="no">Not identified by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
     parts += [f"<p>{html.escape(note)}</p>" for note in result.notes]
     if result.panels:

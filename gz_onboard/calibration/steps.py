@@ -23,7 +23,6 @@ Paths are from the manifest's folder. ``SLOT_columns`` is for the tables of one 
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -227,12 +226,10 @@ def _files(table: Table, slot: str) -> tuple[Path, ...]:
 # --- running ------------------------------------------------------------------------------------------------------
 
 
-def run_steps(
-    steps: Sequence[Step], base: Path, begin: Callable[[str], None] = lambda _: None
-) -> Iterator[tuple[Result, float]]:
+def run_steps(steps: Sequence[Step], base: Path, begin: Callable[[str], None] = lambda _: None) -> Iterator[Result]:
     """Run the `steps`, each with the results of those before it put into the vehicle file `base`.
 
-    Yields each result with the seconds that it took. begin: is called with the name of each part of the work. Raises
+    begin: is called with the name of each part of the work. Raises
     InputError for data that cannot be used, naming the procedure; one of several steps whose sensors no ride has is
     refused, and the others go on.
     """
@@ -240,7 +237,7 @@ def run_steps(
     results: list[Result] = []
     with tempfile.TemporaryDirectory() as folder:
         for step in steps:
-            start, procedure = time.perf_counter(), PROCEDURES[step.procedure]
+            procedure = PROCEDURES[step.procedure]
             vehicle = _vehicle_so_far(base, results, Path(folder) / "vehicle.toml")
             given = Given(vehicle, results, options={**procedure.options, **step.options})
             for slot, files in step.files.items():
@@ -261,7 +258,7 @@ def run_steps(
                     raise InputError(f"{step.procedure}: {error}") from error
                 result = Result(step.procedure, refusals=[f"{error}; what the file says stays"])
             results.append(result)
-            yield result, time.perf_counter() - start
+            yield result
 
 
 def _vehicle_so_far(base: Path, results: Sequence[Result], file: Path) -> Vehicle:

@@ -90,13 +90,13 @@ class Measurements:
 
     columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
     never decreases; two rows at one time are the two sides of a step. lines: where each row stands in the file, from 1
-    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; raised when it is asked for.
+    (for Parquet: its row). trouble: by quantity, why a column of the file cannot be used; raised when it is asked for.
     """
 
     file: Path
     columns: dict[str, Array]
     lines: Sequence[int] = ()
-    trouble: dict[str, str] = field(default_factory=dict)
+    trouble: dict[str, InputError] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -109,7 +109,7 @@ class Measurements:
         if name in self.columns:
             return self.columns[name]
         if name in self.trouble:
-            raise InputError(f"{self.file}: {self.trouble[name]}")
+            raise self.trouble[name]
         known = [*self.columns, *self.trouble]
         kinds = _kinds(name)
         wanted = f", in {' or '.join(kinds)}" if kinds else ""
@@ -134,25 +134,21 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None) -> Measur
     """
     names, raw, lines = _read_parquet(file) if file.suffix in (".parquet", ".pq") else _read_csv(file)
     found: dict[str, Array] = {}
-    trouble: dict[str, str] = {}
-    for quantity, (column, unit, scale, value) in _asked(file, names, columns, trouble).items():
-        values = raw[names.index(column)] if value is None else [value] * len(lines)
-        array, message = _converted(quantity, column, unit, scale, values, lines)
-        if array is None:
-            trouble[quantity] = message
-        else:
-            found[quantity] = array
+    trouble: dict[str, InputError] = {}
+    for quantity, named in _asked(file, names, columns, trouble).items():
+        values = raw[names.index(named.column)] if named.value is None else [named.value] * len(lines)
+        try:
+            found[quantity] = _converted(quantity, named, values, lines, file)
+        except InputError as error:
+            trouble[quantity] = error
+            if columns:  # what somebody has named must be of use
+                raise
+    if "time" in trouble:
+        raise trouble["time"]
     table = Measurements(file, found, lines, trouble)
-    if columns and trouble:  # what somebody has named must be of use
-        raise InputError(f"{file}: {next(iter(trouble.values()))}")
-    if "time" in found:
-        wrong = np.flatnonzero(np.diff(found["time"]) < 0)
-        if len(wrong):
-            row = int(wrong[0]) + 1
-            before, after = found["time"][row - 1], found["time"][row]
-            raise table.error(f"time must not go back, but {after:g} s follows {before:g} s", row)
-    elif "time" in trouble:
-        raise InputError(f"{file}: {trouble['time']}")
+    for row in np.flatnonzero(np.diff(found.get("time", np.empty(0))) < 0)[:1] + 1:
+        before, after = found["time"][row - 1 : row + 1]
+        raise table.error(f"time must not go back, but {after:g} s follows {before:g} s", int(row))
     return table
 
 
@@ -175,7 +171,7 @@ def read_columns(table: Table) -> dict[str, Named]:
 
 
 def _asked(
-    file: Path, names: Sequence[str], columns: Mapping[str, Named] | None, trouble: dict[str, str]
+    file: Path, names: Sequence[str], columns: Mapping[str, Named] | None, trouble: dict[str, InputError]
 ) -> dict[str, Named]:
     """For each quantity its column: as the mapping says, or all by their own names; two for one go to `trouble`."""
     if columns:
@@ -189,7 +185,8 @@ def _asked(
     for name in names:
         quantity = _split(name)[0]
         if quantity in asked:
-            trouble[quantity] = f"columns {asked[quantity].column!r} and {name!r} are both {quantity!r}"
+            both = f"columns {asked[quantity].column!r} and {name!r} are both {quantity!r}"
+            trouble[quantity] = InputError(f"{file}: {both}")
         asked.setdefault(quantity, Named(name))
     return {quantity: named for quantity, named in asked.items() if quantity not in trouble}
 
@@ -216,31 +213,29 @@ def _kinds(quantity: str) -> tuple[str, ...]:
     return _KINDS.get(quantity.rpartition("_")[2], ())
 
 
-def _converted(
-    quantity: str, column: str, unit: str | None, scale: float, values: Sequence[object], lines: Sequence[int]
-) -> tuple[Array | None, str]:
-    """(the column in SI units, "") or (None, why not)."""
-    written = unit if unit is not None else _split(column)[1]
-    kinds = _kinds(quantity)
-    fitting = ", ".join(name for name, (si, *_) in UNITS.items() if si in kinds or not kinds)
+def _converted(quantity: str, named: Named, values: Sequence[object], lines: Sequence[int], file: Path) -> Array:
+    """The column of a quantity in SI units. InputError for no unit, a wrong one, or what is no finite number."""
+    place, written = f"{file}: column {named.column!r}", named.unit
     if written is None:
-        return None, f"column {column!r} has no unit in its name, such as {column}_{(fitting or 's').split(', ')[0]}"
-    conversion = _unit(written)
+        written = _split(named.column)[1]
+    kinds = _kinds(quantity)
+    fitting = [name for name, (si, *_) in UNITS.items() if si in kinds or not kinds]
+    if written is None:
+        raise InputError(f"{place} has no unit in its name, such as {named.column}_{fitting[0]}")
+    conversion, known = _unit(written), f"known are {', '.join(fitting)}"
     if conversion is None:
-        return None, f"column {column!r}: unknown unit {written!r}{nearest(written, UNITS)}; known are {fitting}"
+        raise InputError(f"{place}: unknown unit {written!r}{nearest(written, UNITS)}; {known}")
     si, factor, offset = conversion
     if kinds and si not in kinds:
-        return None, f"column {column!r}: {quantity} cannot be in {written}; known are {fitting}"
-    try:
-        array = np.array(values, dtype=float)
-    except (ValueError, TypeError):
-        array = np.array([_number(value) for value in values])
+        raise InputError(f"{place}: {quantity} cannot be in {written}; {known}")
+    array = np.array([_number(value) for value in values])
     wrong = np.flatnonzero(~np.isfinite(array))
     if len(wrong):
-        row = int(wrong[0])
-        more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        return None, f"line {lines[row]}, column {column!r}: {values[row]!r} is not a finite number{more}"
-    return scale * (array * factor + offset), ""
+        row, more = int(wrong[0]), f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+        raise InputError(
+            f"{file}: line {lines[row]}, column {named.column!r}: {values[row]!r} is not a finite number{more}"
+        )
+    return np.asarray(named.scale * (array * factor + offset))
 
 
 def _number(value: object) -> float:

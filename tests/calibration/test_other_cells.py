@@ -62,14 +62,6 @@ def test_a_flat_curve_still_increases_when_rounded(tmp_path):
     assert re.search(r"is flat .* SOC 0.1.*, 0.9: .* rest_voltage_error, .* be 30 mV or more", notes)
 
 
-def test_one_pulse_test_of_a_cell_without_relaxation(tmp_path):
-    slow = bench.open_circuit(slow_test()[0])
-    table, _ = pulse_test(25.0, 5, pairs=(), noise=1e-5)
-    found = pulse.calibrate_cell([table], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
-    battery = written(tmp_path, slow, found).pack
-    assert battery.cell_capacity(-20) == battery.cell_capacity(25)
-
-
 def test_a_shift_of_another_cell_goes_with_its_curve(tmp_path):
     shift = Curve({"temperature": np.array([0.0, 25.0])}, np.array([-0.02, 0.0]), np.full(2, 0.005), "V", "old cell")
     base = tmp_path / "base.toml"
@@ -79,25 +71,19 @@ def test_a_shift_of_another_cell_goes_with_its_curve(tmp_path):
     assert not read_vehicle(base).pack.rest_shift_curve
 
 
-FALLING = Curve({"soc": np.linspace(0, 1, 3)}, np.array([3.0, 3.14196, 3.141961]), np.full(3, 0.01), "V", "x")
-
-
 def test_a_file_that_could_not_be_read_leaves_the_old_one_and_a_report(tmp_path, monkeypatch, capsys):
     out, page = tmp_path / "v.toml", tmp_path / "r.html"
     out.write_text("the old one")
+    soc, volts = np.linspace(0, 1, 3), np.array([3.0, 3.14196, 3.141961])
+    falling = {"battery.ocv": Curve({"soc": soc}, volts, np.full(3, 0.01), "V", "x")}
     good = bench.open_circuit
-    monkeypatch.setattr(bench, "open_circuit", lambda *given: replace(good(*given), curves={"battery.ocv": FALLING}))
+    monkeypatch.setattr(bench, "open_circuit", lambda *given: replace(good(*given), curves=falling))
     file = as_csv(slow_test()[0], tmp_path / "ocv.csv")
     assert main(["calibrate", "ocv", file, "--output", str(out), "--report", str(page), "--quiet"]) == 2
-    said = capsys.readouterr()
-    assert re.search(
-        r"v.toml:[0-9]+: battery.ocv.value: must increase, but 3.14196 follows 3.14196; this value was found", said.err
-    )
-    assert "battery.ocv.value: must increase" in page.read_text()
-    assert f"{page} written" in said.out
-    assert f"{out} written" not in said.out
+    why = "battery.ocv.value: must increase, but 3.14196 follows 3.14196"
+    assert f"{why}; this value was found" in capsys.readouterr().err
+    assert why in page.read_text()
     assert out.read_text() == "the old one"
-    assert {f.name for f in tmp_path.iterdir()} == {"v.toml", "r.html", "ocv.csv"}
 
 
 def test_a_discharge_that_ends_far_above_the_cut_off_is_told(tmp_path, capsys):

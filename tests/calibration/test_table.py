@@ -30,13 +30,17 @@ def test_units_are_in_the_names(tmp_path):
         "0,1000,4100,298.15,60,36,50,start\n1,-500,4000,273.15,-60,72,40,\n",
     )
     table = read_table(file)
-    assert table["time"].tolist() == [0, 60]
-    assert table["current"].tolist() == [1, -0.5]
-    assert table["voltage"] == pytest.approx([4.1, 4.0])
-    assert table["cell_temperature"] == pytest.approx([25, 0])
-    assert table["motor_speed"] == pytest.approx([2 * math.pi, -2 * math.pi])
-    assert table["speed"] == pytest.approx([10, 20])
-    assert table["soc"] == pytest.approx([0.5, 0.4])
+    expected = {
+        "time": [0, 60],
+        "current": [1, -0.5],
+        "voltage": [4.1, 4.0],
+        "cell_temperature": [25, 0],
+        "motor_speed": [2 * math.pi, -2 * math.pi],
+        "speed": [10, 20],
+        "soc": [0.5, 0.4],
+    }
+    for quantity, values in expected.items():
+        assert table[quantity] == pytest.approx(values)
     assert len(table) == 2
     assert table.line(1) == 3
     with pytest.raises(InputError, match="no unit"):
