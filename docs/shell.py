@@ -24,7 +24,7 @@ ABOUT = "the remaining range of an electric scooter, estimated from its CAN bus"
 OR_FILE = {  # names in place of which a file may be given, by the function that completes them
     "_gz_onboard_vehicles": tuple(sorted(file.stem for file in OWN.glob("*.toml"))),
     "_gz_onboard_procedures": ("all", *PROCEDURES),
-    "_gz_onboard_cycles": cycles.names(),
+    "_gz_onboard_cycles": cycles.NAMES,
 }
 
 

@@ -14,20 +14,20 @@ from pathlib import Path
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.routes.columns import METRES_PER_SECOND, read_columns
 
-_GTR2 = "UN GTR No. 2, Annex 5 (the same in Regulation (EU) No 134/2014, Annex II, Appendix 6)"
-_TITLES = {
-    "ece15": ("ECE-15 urban driving cycle (UDC)", "UN Regulations No. 15 and No. 83, Annex 4"),
-    "r40": ("R40 for motorcycles: six times ECE-15", "UN Regulation No. 40, Annex 4"),
-    "udds": ("Urban Dynamometer Driving Schedule", "40 CFR Part 86, Appendix I (a)"),
-    "wmtc_part1": ("WMTC part 1", _GTR2),
-    "wmtc_part1_reduced": ("WMTC part 1, reduced speed", _GTR2),
-    "wmtc_part2": ("WMTC part 2", _GTR2),
-    "wmtc_part3": ("WMTC part 3", _GTR2),
-    "wmtc_class1": ("WMTC classes 1-1 and 1-2: part 1 at reduced speed, twice", _GTR2),
-    "wmtc_class1_3": ("WMTC class 1-3: part 1, twice", _GTR2),
-    "wmtc_class2_2": ("WMTC class 2-2: parts 1 and 2", _GTR2),
-    "wmtc_class3_2": ("WMTC class 3-2: parts 1, 2 and 3", _GTR2),
-}
+NAMES = (
+    "ece15",
+    "r40",
+    "udds",
+    "wmtc_part1",
+    "wmtc_part1_reduced",
+    "wmtc_part2",
+    "wmtc_part3",
+    "wmtc_class1",
+    "wmtc_class1_3",
+    "wmtc_class2_2",
+    "wmtc_class3_2",
+)
+"""Built-in cycles."""
 _PARTS = {
     "r40": ("ece15",) * 6,
     "wmtc_class1": ("wmtc_part1_reduced",) * 2,
@@ -51,8 +51,6 @@ class Cycle:
     name: str
     time: tuple[float, ...]
     speed: tuple[float, ...]
-    source: str
-    title: str
 
     @property
     def duration(self) -> float:
@@ -64,26 +62,20 @@ class Cycle:
         _joined((self, self))
 
 
-def names() -> tuple[str, ...]:
-    """Names of the built-in cycles."""
-    return tuple(_TITLES)
-
-
 @cache
 def cycle(name: str) -> Cycle:
     """The built-in cycle `name`, one sample a second.
 
     Raises InputError, with the nearest name, if there is none.
     """
-    if name not in _TITLES:
-        raise InputError(f"unknown cycle {name!r}{nearest(name, names())}; known are {', '.join(names())}")
-    title, source = _TITLES[name]
+    if name not in NAMES:
+        raise InputError(f"unknown cycle {name!r}{nearest(name, NAMES)}; known are {', '.join(NAMES)}")
     if name in _PARTS:
         time, speed = _joined(tuple(cycle(part) for part in _PARTS[name]))
     else:
         speed = _ece15() if name == "ece15" else _table()[name]
         time = tuple(float(second) for second in range(len(speed)))
-    return Cycle(name, time, speed, source, title)
+    return Cycle(name, time, speed)
 
 
 def read_cycle(file: Path | str) -> Cycle:
@@ -111,13 +103,7 @@ def read_cycle(file: Path | str) -> Cycle:
             gap = f"gap from {before:g} s to {after:g} s, other steps are {step:g} s; resample the cycle to even steps"
             raise columns.error(row, f"time_s: {gap}")
     columns.check(column, 0.0, _MAX_SPEED / speeds[column], column.removeprefix("speed_"))
-    return Cycle(
-        file.stem,
-        tuple(t - time[0] for t in time),
-        tuple(value * speeds[column] for value in values),
-        str(file),
-        file.stem,
-    )
+    return Cycle(file.stem, tuple(t - time[0] for t in time), tuple(value * speeds[column] for value in values))
 
 
 def find_cycle(name_or_file: str) -> Cycle:
@@ -125,14 +111,14 @@ def find_cycle(name_or_file: str) -> Cycle:
 
     Raises InputError, with the nearest built-in name, if there is neither.
     """
-    if name_or_file in _TITLES:
+    if name_or_file in NAMES:
         return cycle(name_or_file)
     file = Path(name_or_file)
     if file.exists() or file.suffix:
         return read_cycle(file)
     raise InputError(
-        f"{name_or_file!r} is neither a file nor a built-in cycle{nearest(name_or_file, names())}; "
-        f"built in are {', '.join(names())}"
+        f"{name_or_file!r} is neither a file nor a built-in cycle{nearest(name_or_file, NAMES)}; "
+        f"built in are {', '.join(NAMES)}"
     )
 
 

@@ -165,10 +165,6 @@ class Driveline:
     has_front_wheel: bool
     slip: float = 0.0
 
-    def kinetic_energy(self, speed: float, wheel_speed: float) -> float:
-        """Return the kinetic energy of vehicle and wheels [J] at these speeds [m/s, rad/s]."""
-        return 0.5 * (self.moving_mass * speed**2 + self.wheel_inertia * wheel_speed**2)
-
     def friction(self, slip: float) -> tuple[float, float]:
         """Return (µ, dµ/dκ) of the tyre (eq. 3.12)."""
         b, c, d, e = self.tyre

@@ -14,9 +14,9 @@ from gz_onboard.recording.recording import facts_of, ride_name, rider_mass
 from gz_onboard.routes.route import Route, read_route, speed_profile
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table, straight
-from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
+from gz_onboard.simulation.recorded import Recorded, along_road, fit_dynamometer, read_recorded
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay
-from gz_onboard.simulation.scooter import STEP
+from gz_onboard.simulation.scooter import STEP, AlongRoad
 from gz_onboard.simulation.turning import MODELS
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -24,7 +24,7 @@ _LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
 """m/s: what a rider aims for on a route without limits."""
 Ground = RoadProfile | Dynamometer
-Heading = float | Callable[[float], float]
+Heading = float | AlongRoad
 
 
 RANGES: dict[str, tuple[float, float, str]] = {
@@ -79,7 +79,7 @@ class Plan:
     length: float | None = None  # m, of one repetition; None if it ends by time
     recorded: Recorded | None = None
     heading: Heading = 0.0  # rad clockwise from north, where it begins or over distance
-    vibration: Callable[[float], float] | None = None  # m/s² over distance, as it was recorded
+    vibration: AlongRoad | None = None  # m/s² over distance, as it was recorded
 
 
 def find_plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
@@ -182,7 +182,7 @@ def _ride_plan(path: Path, options: SimulationOptions, vehicle: Vehicle, roller:
             )
         throttle, brake = signals["throttle"].tolist(), signals["brake"].tolist()
         kind, command = "ride (open loop)", lambda: replay(throttle, brake, STEP)
-    rough = recorded.vibration is not None and not isinstance(road, Dynamometer)
+    rough = None if isinstance(road, Dynamometer) else recorded.vibration
     return Plan(
         recorded.name,
         kind,
@@ -191,7 +191,7 @@ def _ride_plan(path: Path, options: SimulationOptions, vehicle: Vehicle, roller:
         command,
         recorded=recorded,
         heading=heading,
-        vibration=recorded.vibration_at if rough else None,
+        vibration=None if rough is None else along_road(rough),
     )
 
 
@@ -212,10 +212,11 @@ def ridden_road(
     recorded: Recorded, log: Path, headwind: float = 0.0, roller: Dynamometer | None = None
 ) -> tuple[Ground, Heading]:
     """(surface of the ride, its heading): a roller, the road of the log's route file, or that of the filter."""
+    heading = 0.0 if recorded.heading is None else along_road(recorded.heading)
     if roller or recorded.on_dynamometer:
-        return roller or fit_dynamometer(recorded), recorded.heading_at
+        return roller or fit_dynamometer(recorded), heading
     if not route_file(log).is_file():
-        return recorded.road(headwind), recorded.heading_at
+        return recorded.road(headwind), heading
     route = _with_heights(route_file(log))
     return road_table(route.distance, route.grade, route.curvature, headwind), route.heading[0]
 

@@ -27,7 +27,7 @@ from gz_onboard.recording.decode import feed
 from gz_onboard.recording.recording import open_ride, read_recording, ride_name
 from gz_onboard.recording.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts import Dynamometer, RoadProfile, road_table
-from gz_onboard.simulation.scooter import STEP, Scooter
+from gz_onboard.simulation.scooter import STEP, AlongRoad, Scooter
 from gz_onboard.vehicle import Vehicle
 
 
@@ -92,15 +92,6 @@ class Recorded:
         if "pack_voltage" not in self.signals or "pack_current" not in self.signals:
             return None
         return float((self.signals["pack_voltage"] * self.signals["pack_current"]).sum() * self.dt)
-
-    def heading_at(self, distance: float) -> float:
-        """The heading [rad] at `distance` [m]; north where none is known."""
-        return 0.0 if self.heading is None else _at(self.heading, distance)
-
-    def vibration_at(self, distance: float) -> float:
-        """How rough the road is [m/s²] at `distance` [m]; only if `vibration` is known."""
-        assert self.vibration is not None
-        return _at(self.vibration, distance)
 
     def road(self, headwind: float = 0.0) -> RoadProfile:
         """The road that was ridden."""
@@ -182,9 +173,9 @@ def _over_road(distance: Array, values: Array, period: float | None = None) -> A
     )
 
 
-def _at(table: Array, distance: float) -> float:
-    """What `table`, each `road_piece_m`, has at `distance` [m]; beyond its ends the edge."""
-    return float(table[min(max(int(distance / CONFIG.road_piece_m), 0), len(table) - 1)])
+def along_road(table: Array) -> AlongRoad:
+    """The values of `table`, each `road_piece_m`, at a distance [m]; beyond its ends the edge."""
+    return lambda distance: float(table[min(max(int(distance / CONFIG.road_piece_m), 0), len(table) - 1)])
 
 
 def scooter_at_start(

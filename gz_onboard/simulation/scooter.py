@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import sqrt
 from operator import mul
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.model.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
@@ -42,41 +42,45 @@ VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag wo
 RARE = {"turning", "not_delivered"}  # in the ledger only if there was any
 
 
-class Options(TypedDict, total=False):
-    """Start of a simulation, and parts that replace the vehicle's own."""
-
-    soc: float  # 1 if not given
-    ambient: float  # degC; 20
-    cell_temperature: float | None  # degC; the ambient
-    altitude: float  # m; 0
-    speed: float  # m/s; 0
-    dt: float  # s; STEP
-    heading: float | Callable[[float], float]  # rad clockwise from north: where the road begins, or over distance [m]
-    vibration: float | Callable[[float], float] | None  # m/s²: how rough the road is, or over distance [m]
-    pack: PackModel | None
-    motor: Motor | None
-    chassis: Chassis | None
+AlongRoad = Callable[[float], float]
+"""A quantity at a distance [m]."""
 
 
 class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
-    A chassis that turns is refused (InputError) together with an effect that is the same loss. Effects in the cells
-    act in `FirstOrderPack` only. Without `vibration` a road is as rough as the vehicle's file expects, and a roller
-    smooth. A `heading` given as a number turns with the road.
+    soc, ambient [degC], altitude [m], speed [m/s]: at the start; cell_temperature [degC]: the ambient if None. dt [s]:
+    of a step. heading [rad clockwise from north]: where the road begins, then turning with it, or over distance.
+    vibration [m/s²]: how rough the road is; if None as the vehicle's file expects, and a roller smooth. pack, motor,
+    chassis: replace the vehicle's own; effects in the cells act in `FirstOrderPack` only. A chassis that turns is
+    refused (InputError) together with an effect that is the same loss.
     """
 
     def __init__(
-        self, vehicle: Vehicle, road: RoadProfile | Dynamometer | None = None, **options: Unpack[Options]
+        self,
+        vehicle: Vehicle,
+        road: RoadProfile | Dynamometer | None = None,
+        *,
+        soc: float = 1.0,
+        ambient: float = MILD,
+        cell_temperature: float | None = None,
+        altitude: float = 0.0,
+        speed: float = 0.0,
+        dt: float = STEP,
+        heading: float | AlongRoad = 0.0,
+        vibration: float | AlongRoad | None = None,
+        pack: PackModel | None = None,
+        motor: Motor | None = None,
+        chassis: Chassis | None = None,
     ) -> None:
         if vehicle.battery is None:
             raise vehicle.error("has no [battery], which a simulation needs")
         self.vehicle = vehicle
         self.dynamometer = road if isinstance(road, Dynamometer) else None
         self.road: RoadProfile = straight() if road is None or isinstance(road, Dynamometer) else road
-        self.dt = options.get("dt", STEP)
-        self.ambient = options.get("ambient", MILD)
-        self.speed = options.get("speed", 0.0)  # m/s
+        self.dt = dt
+        self.ambient = ambient
+        self.speed = speed  # m/s
         self.wheel_speed = self.speed / vehicle.parameters["wheel_radius"]  # rad/s
         self.distance = self.climb = 0.0  # m
         self.time = self.time_moving = 0.0  # s
@@ -84,10 +88,9 @@ class Scooter:
         self.throttle = self.brake = 0.0
         self.force = self.rear_load = self.front_load = 0.0  # N; of the driven tyre, on the axles
         self._q: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
-        self._set_surroundings(options)
-        cells = options.get("cell_temperature")
-        self._build_electric(options, self.ambient if cells is None else cells)
-        self._build_mechanic(options)
+        self._set_surroundings(altitude, heading, vibration)
+        self._build_electric(soc, ambient if cell_temperature is None else cell_temperature, pack, motor)
+        self._build_mechanic(chassis)
         self._names = [*self._force_names, *self._rolling_names, "turning", "dynamometer", "tyre_slip", "brakes"]
         self._names += ["gearing", *self._loss_names, "bms", "battery_heat", "not_delivered", "idle", "charge"]
         self._noted: list[tuple[Any, ...]] = []  # of each step since the last booking, by `_names`
@@ -96,9 +99,8 @@ class Scooter:
         self._since_cooling = 0.0  # s
         self._watch()
 
-    def _set_surroundings(self, options: Options) -> None:
+    def _set_surroundings(self, altitude: float, heading: float | AlongRoad, rough: float | AlongRoad | None) -> None:
         """The surroundings that effects read."""
-        heading, rough = options.get("heading", 0.0), options.get("vibration")
         self._heading_at = heading if callable(heading) else None
         self.start_heading = self.heading = heading(0.0) if callable(heading) else heading  # rad
         if rough is None:
@@ -111,17 +113,17 @@ class Scooter:
         self._tracks = bool(model.reads & SURROUNDINGS or CELLS & frozenset().union(*outside))
         self._q |= {
             "mass": model.mass,
-            "air_density": air_density(self.ambient, options.get("altitude", 0.0)),
+            "air_density": air_density(self.ambient, altitude),
             "grade_cosine": 1.0,
             "motor_temperature": self.ambient,
             "ambient_temperature": self.ambient,
             "heading": self.heading,
         }
 
-    def _build_electric(self, options: Options, celsius: float) -> None:
+    def _build_electric(self, soc: float, celsius: float, pack: PackModel | None, motor: Motor | None) -> None:
         """Pack, motor, inverter and what cools them; celsius: the cells' temperature."""
         vehicle, p, dt = self.vehicle, self.vehicle.parameters, self.dt
-        model, battery, soc = vehicle.model, vehicle.pack, options.get("soc", 1.0)
+        model, battery = vehicle.model, vehicle.pack
         self.voltage = battery.cells_series * battery.ocv(soc, celsius)[0]
         self.sensed_voltage = self.voltage  # V, as the controller has it
         self._series = battery.cells_series
@@ -129,8 +131,8 @@ class Scooter:
         self._q["cell_capacity"] = battery.cell_capacity(celsius)
         cells = model.at(Port.CELL_VOLTAGE)
         inside = stepper(cells, dt) if cells else None
-        self.pack: PackModel = options.get("pack") or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
-        self.motor = options.get("motor")
+        self.pack: PackModel = pack or FirstOrderPack(battery, soc, effects=inside, quantities=self._q)
+        self.motor = motor
         of_motor, of_inverter = [] if self.motor else model.at(Port.MOTOR_LOSS), model.at(Port.INVERTER_LOSS)
         losses = [*of_motor, *of_inverter, *model.at(Port.DC_POWER)]
         turning_idly = self._q | {"motor_speed": 100.0, "motor_temperature": MILD}
@@ -153,10 +155,10 @@ class Scooter:
         self._cooling_factor = p["cooling_factor"]
         self._bms_resistance = min(p["bms_resistance"], battery.series_resistance)  # its part of it
 
-    def _build_mechanic(self, options: Options) -> None:
+    def _build_mechanic(self, chassis: Chassis | None) -> None:
         """Chassis, tyre, brakes and the forces of the road."""
         model, p, roller = self.vehicle.model, self.vehicle.parameters, self.dynamometer
-        self.chassis = options.get("chassis")
+        self.chassis = chassis
         for effect in model.effects:
             if self.chassis and traits(effect).turning_loss:
                 raise self.vehicle.error(
@@ -226,7 +228,8 @@ class Scooter:
 
     def kinetic_energy(self) -> float:
         """Of vehicle and wheels [J]."""
-        return self.driveline.kinetic_energy(self.speed, self.wheel_speed)
+        driven = self.driveline
+        return 0.5 * (driven.moving_mass * self.speed**2 + driven.wheel_inertia * self.wheel_speed**2)
 
     def potential_energy(self) -> float:
         """Over the start [J]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 from gz_onboard.errors import InputError, closest
 from gz_onboard.model.parameters import declared_parameters
@@ -40,12 +41,10 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     first, dots, second = span.partition("..")
     if not dots or (steps and not steps.isdecimal()):
         raise InputError(f"--sweep {text}: must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5")
-    ends = []
-    for number in (first, second):
-        try:
-            ends.append(float(number))
-        except ValueError:
-            raise InputError(f"--sweep {text}: {number!r} is not a number") from None
+    try:
+        ends = [float(first), float(second)]
+    except ValueError:
+        raise InputError(f"--sweep {text}: {first!r} and {second!r} must be numbers") from None
     found = sweep_of(name.strip(), ends, vehicle, f"--sweep {text}")
     low, high = ends
     if not low < high:
@@ -109,7 +108,4 @@ def redesigned(vehicle: Vehicle, values: Mapping[str, float]) -> Vehicle:
 
 def grid(sweeps: Sequence[Sweep]) -> list[dict[str, float]]:
     """The values of each variant; the last sweep changes fastest."""
-    points: list[dict[str, float]] = [{}]
-    for sweep in sweeps:
-        points = [{**point, sweep.name: value} for point in points for value in sweep.values]
-    return points
+    return [dict(zip((s.name for s in sweeps), values, strict=True)) for values in product(*(s.values for s in sweeps))]

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.backward import RideConditions, backward
 from gz_onboard.model.effect import Port, load_effect, package_effects
-from gz_onboard.simulation.cycles import cycle, names
+from gz_onboard.simulation.cycles import NAMES, cycle
 from gz_onboard.simulation.parts import Dynamometer, FirstOrderPack, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -183,7 +183,7 @@ def test_backward_agrees_with_forward_with_all_forces():
 
 
 def _cycle() -> tuple[Any, Any]:
-    wmtc = cycle(names()[0])
+    wmtc = cycle(NAMES[0])
     return wmtc.time, wmtc.speed
 
 

@@ -17,7 +17,7 @@ from gz_onboard.discovery.grid import vibration as of_samples
 from gz_onboard.model.effect import load_effect
 from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import straight
-from gz_onboard.simulation.recorded import Recorded, read_recorded
+from gz_onboard.simulation.recorded import Recorded, along_road, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.validation.components import road_load
@@ -114,7 +114,8 @@ def test_of_a_recorded_ride_it_is_what_the_accelerometer_shows(recorded: Recorde
     assert shown[settled].std() > 0.05
     middle = recorded.signals["distance"][-1] / 2
     at = int(np.searchsorted(recorded.signals["distance"], middle))
-    assert recorded.vibration_at(middle) == pytest.approx(found[at], abs=0.2)
+    assert recorded.vibration is not None
+    assert along_road(recorded.vibration)(middle) == pytest.approx(found[at], abs=0.2)
 
 
 def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
