@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from gz_onboard.arrays import block_means
 from gz_onboard.calibration.circuit import Circuit, Reaction, voltage
 from gz_onboard.calibration.coastdown import Coast, RoadLoad
-from gz_onboard.calibration.cooling import ENTROPY, ENTROPY_SOC, CoolingRun, motor_temperatures, pack_temperatures
 from gz_onboard.discovery import residuals
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.mixed_model import initial
@@ -24,7 +23,7 @@ from gz_onboard.model.series import bilinear_over, curve_over, extended_over, id
 from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import FirstOrderPack, Rider
 from gz_onboard.simulation.scooter import STEP, Scooter
-from gz_onboard.validation.components import battery_voltage, components, losses, road_load
+from gz_onboard.validation.components import components, losses, road_load
 from gz_onboard.vehicle import read_vehicle
 
 LOG = Path(__file__).resolve().parents[2] / "replay_logs" / "city_14C.blf"
@@ -129,11 +128,6 @@ def test_the_estimator_predicts_the_voltage_of_a_cell(ride):
     assert predicted == pytest.approx(written_out(ride, reaction=0.0)[0], abs=0.1 * MILLIVOLT)
 
 
-def test_validation_has_the_same_voltage_of_a_cell(ride):
-    pack = battery_voltage(VEHICLE, ride, SOC)
-    assert PACK.cell_voltage(pack, ride["pack_current"]) == pytest.approx(written_out(ride)[0], abs=0.1 * MILLIVOLT)
-
-
 def test_discovery_has_the_same_voltage_of_a_cell(ride):
     values, system = healthy()
     grid = on_grid(ride)
@@ -184,39 +178,6 @@ def test_the_simulation_draws_the_same_current_and_heat(ride):
     assert heats.mean() == pytest.approx((heat + series).mean(), rel=0.02)
 
 
-def test_validation_and_calibration_warm_the_cells_alike(ride):
-    modelled = components(VEHICLE, ride, SOC, AMBIENT, None)["cell_temperature"].modelled
-    count = SOC - np.cumsum(ride["pack_current"] / (3600 * PACK.pack_capacity(float(ride["cell_temperature"][0]))))
-    rest = PACK.cells_series * ocv_over(PACK, count, ride["cell_temperature"])
-    series = PACK.cells_series * ride["pack_current"]
-    lost = (rest - ride["pack_voltage"]) * ride["pack_current"]
-    run = calibration_run(ride, pack_heat=lost, series_current=series, soc=count)
-    assert PACK.entropy
-    disorder = dict(zip(ENTROPY, curve_over(PACK.entropy, np.array(ENTROPY_SOC)), strict=True))
-    exposed = dict(P) | {"pack_conductance": P["pack_conductance"] * P["cooling_factor"]} | disorder
-    start = float(ride["cell_temperature"][0]) - pack_temperatures(exposed, run)["cell_temperature"][0]
-    by_calibration = pack_temperatures(exposed | {"start:ride:cell_temperature": start}, run)["cell_temperature"]
-    assert modelled == pytest.approx(by_calibration, abs=1e-6)
-
-
-def calibration_run(ride, **heats):
-    nothing = np.zeros(len(ride["speed"]))
-    names = ("motor_heat", "iron", "inverter_heat", "pack_heat", "series_current", "soc")
-    parts = dict.fromkeys(names, nothing) | heats
-    measured = {name: ride[name] for name in ("motor_temperature", "cell_temperature")}
-    time = np.arange(len(nothing), dtype=float)
-    return CoolingRun(
-        name="ride",
-        bench=False,
-        time=time,
-        ambient=ride["ambient_temperature"],
-        air=ride["speed"],
-        pack_square=nothing,
-        measured=measured,
-        **parts,
-    )
-
-
 def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     with_current, idle, inverter = losses(
         VEHICLE, ride["motor_current"], ride["motor_speed"], ride["motor_temperature"]
@@ -237,18 +198,6 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     rows = zip(*(q[name] for name in names), strict=True)
     booked = [sum(simulated(q | dict(zip(names, map(float, row), strict=True)))) for row in rows]
     assert booked == pytest.approx(by_model, rel=1e-6, abs=1e-6)
-
-
-def test_calibration_and_discovery_warm_the_motor_alike(ride):
-    values, system = healthy()
-    grid = on_grid(ride)
-    still = values | {"motor_start": 0.0, "rotor_start": 0.0, "motor_airflow": 0.0}
-    modelled = block_means(grid.signals["motor_temperature"], 10) - residuals.motor_temperature(grid, still, system)
-    heat, idle = residuals._heat(grid, values, system)[:2]
-    run = calibration_run(ride, motor_heat=heat, iron=idle)
-    start = modelled[0] - motor_temperatures(P, run)["motor_temperature"][0]
-    by_calibration = motor_temperatures(dict(P) | {"start:ride:motor_temperature": start}, run)["motor_temperature"]
-    assert modelled == pytest.approx(by_calibration, abs=1e-6)
 
 
 NO_NUISANCE = {
@@ -327,13 +276,6 @@ def test_a_coast_down_is_held_back_as_the_model_says(speed, slope):
     model = VEHICLE.model
     expected = sum(effect(q) for effect in model.at(*ROAD_LOAD)) + idle_loss(model, q) / speed
     assert force == pytest.approx(expected)
-
-
-def test_resistances_are_geometric_over_temperature():
-    mesh = Mesh((0.0, 1.0), (0.0, 20.0), ((0.09, 0.16), (0.01, 0.04)), geometric=True)
-    assert mesh.at(0.0, 10.0)[0] == pytest.approx(0.03)
-    assert mesh.at(1.0, 10.0)[0] == pytest.approx(0.08)
-    assert mesh.scaled(2.0).at(1.0, 10.0)[0] == pytest.approx(0.16)
 
 
 AXIS = st.lists(st.floats(-1, 2), min_size=2, max_size=6, unique_by=lambda x: round(x, 2)).map(sorted)

@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.backward import RideConditions, backward
 from gz_onboard.model.effect import Port, load_effect, package_effects
-from gz_onboard.simulation.cycles import NAMES, cycle
 from gz_onboard.simulation.parts import Dynamometer, FirstOrderPack, straight
-from gz_onboard.simulation.run import Run, at_steps, drive, follow
+from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, latency
 from gz_onboard.simulation.truth import Truth
@@ -169,22 +167,6 @@ def test_on_a_dynamometer_what_is_at_the_wheel_acts_and_air_and_bends_do_not():
     assert {"dragging_brake", "drivetrain_drag", "tyre_warm_up"} <= set(run.ledger)
     assert not {"cornering_drag", "headwind", "aerodynamic_drag"} & set(run.ledger)
     assert abs(run.closure) < 1e-4
-
-
-def test_backward_agrees_with_forward_with_all_forces():
-    vehicle = extended("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag", wind_east=3.0)
-    speeds = at_steps(*_cycle(), STEP)
-    curve = 0.004
-    scooter = Scooter(vehicle, lambda distance: (0.0, curve, 0.0), soc=0.9)
-    run = drive(scooter, follow(speeds, STEP), 300.0)
-    energy = backward(vehicle, run.series["time"], run.series["speed"], RideConditions(curvature=curve), smoothing=0.0)
-    for name in ("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag"):
-        assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02, abs=200.0), name
-
-
-def _cycle() -> tuple[Any, Any]:
-    wmtc = cycle(NAMES[0])
-    return wmtc.time, wmtc.speed
 
 
 def test_what_the_sensors_show_of_it():

@@ -128,18 +128,6 @@ def test_road_of_pieces(widths, at):
         assert road(distance) == (0.001 * piece, 0.0, 2.0)
 
 
-def test_uphill_costs_what_it_lifts():
-    flat, hill = (ridden_at(grade) for grade in (0.0, 0.03))
-    lifted = hill.ledger["potential_energy"]
-    assert lifted == pytest.approx(VEHICLE.model.mass * 9.80665 * 0.03 * hill.distance, rel=1e-3)
-    assert hill.energy > flat.energy + lifted
-
-
-def ridden_at(grade):
-    scooter = Scooter(VEHICLE, straight(grade), soc=0.8)
-    return drive(scooter, follow([6.0] * 12_000, 0.01), 120)
-
-
 def test_a_hill_that_it_cannot_climb_is_a_shortfall_and_no_ride_backwards():
     c = cycle("ece15")
     command = follow(at_steps(c.time, c.speed, STEP), STEP)

@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.model.functions import Mesh
 from gz_onboard.simulation.parts import Rider, straight
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
-from tests.simulation.packs import MapMotor, SecondOrderPack
 from tests.support import without_cell_effects
 
 VEHICLE = without_cell_effects(read_vehicle("reference", 75.0))
@@ -109,27 +107,6 @@ def test_coasting_down_against_a_fine_integration_written_out():
         v -= dt * (drag + rolling + iron) / inertia
     assert scooter.speed == pytest.approx(v, abs=0.02)
     assert scooter.motor_current == 0
-
-
-def test_the_battery_can_be_replaced():
-    """A two-RC pack sags more in the long run; the rest of the scooter does not know."""
-    one = follow(Scooter(VEHICLE, soc=0.8), town, 600)
-    two = follow(Scooter(VEHICLE, soc=0.8, pack=SecondOrderPack(BATTERY, 0.8)), town, 600)
-    assert two.ledger["battery_heat"] > 1.005 * one.ledger["battery_heat"]
-    assert two.distance == pytest.approx(one.distance, rel=1e-3)
-    drawn, accounted = closure(two, 0.0)
-    assert accounted == pytest.approx(drawn, rel=1e-4)
-
-
-def test_the_motor_can_be_replaced_by_a_measured_map():
-    speeds, currents = (0.0, 20.0, 40.0, 60.0), (-60.0, 0.0, 60.0, 120.0, 220.0)
-    loss = tuple(tuple(0.017 * i * i + 0.9 * w + 0.0154 * w * w for i in currents) for w in speeds)
-    motor = MapMotor(Mesh(currents, speeds, loss))
-    scooter = follow(Scooter(VEHICLE, soc=0.8, motor=motor), town, 200)
-    assert scooter.ledger["motor_map_loss"] > 0
-    assert "motor_copper_loss" not in scooter.ledger
-    drawn, accounted = closure(scooter, 0.0)
-    assert accounted == pytest.approx(drawn, rel=1e-4)
 
 
 def test_heat_balance_of_the_cooling_networks():

@@ -11,8 +11,6 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.simulation.run import COLUMNS
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
-from gz_onboard.simulation.sweep import read_sweep
-from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
 
 PNG = b"\x89PNG"
@@ -125,13 +123,6 @@ def test_sweep_of_one_parameter(short, tmp_path, capsys):
     assert (tmp_path / "short.simulation.sweep.png").read_bytes().startswith(PNG)
 
 
-@pytest.mark.parametrize("name", ["battery.parallel", "battery.cells_parallel"])
-def test_sweep_of_cells_takes_every_number(name):
-    sweep = read_sweep(f"{name}=8..16", read_vehicle("reference"))
-    assert sweep.values == tuple(float(count) for count in range(8, 17))
-    assert sweep.name == "battery.cells_parallel"
-
-
 def test_sweep_of_two(short, tmp_path, capsys):
     sweeps = ("--sweep", "battery.parallel=10..12", "--sweep", "payload_mass=60..120:2")
     assert simulate(short, *sweeps, "--format", "svg", "--format", "csv", "--output", tmp_path) == 0
@@ -212,21 +203,3 @@ def test_bad_files_are_refused_by_line(tmp_path, capsys, text, words):
     assert len(message) < 600 + len(str(file))
     for word in words:
         assert word in message
-
-
-def test_a_route_in_gpx_is_the_one_in_csv(tmp_path, capsys):
-    points = [(48 + i * 3e-4, 11.5, 500 + i % 7) for i in range(31)]
-    (tmp_path / "way.csv").write_text(
-        "latitude_deg,longitude_deg,altitude_m\n" + "".join(f"{x:.6f},{y},{z}\n" for x, y, z in points)
-    )
-    track = "".join(f'<trkpt lat="{x:.6f}" lon="{y}"><ele>{z}</ele></trkpt>' for x, y, z in points)
-    (tmp_path / "way.gpx").write_text(f"<gpx><trk><trkseg>{track}</trkseg></trk></gpx>")
-    told = []
-    for name in "way.csv", "way.gpx":
-        found = tmp_path / "out.json"
-        assert simulate(tmp_path / name, "--no-plot", "--no-series", "--json", found, "--output", tmp_path) == 0
-        told.append(json.loads(found.read_text()))
-    assert told[0]["consumption_wh_km"] == told[1]["consumption_wh_km"] > 0
-    (tmp_path / "flat.gpx").write_text((tmp_path / "way.gpx").read_text().replace("ele>", "el>"))
-    assert simulate(tmp_path / "flat.gpx", "--output", tmp_path) == 2
-    assert "flat.gpx: has no altitudes" in capsys.readouterr().err

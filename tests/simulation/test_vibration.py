@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
 from gz_onboard.discovery.grid import vibration as of_samples
 from gz_onboard.model.effect import load_effect
@@ -20,8 +19,6 @@ from gz_onboard.simulation.parts import straight
 from gz_onboard.simulation.recorded import Recorded, along_road, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter
-from gz_onboard.validation.components import road_load
-from gz_onboard.validation.ride import per_second
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import LOGS, joined, without_cell_effects
 
@@ -84,17 +81,6 @@ def test_a_rough_road_takes_more(folder: Path):
     assert per_metre[2] - per_metre[0] > NEWTONS * 2.2 * 0.9
 
 
-def test_backward_agrees_with_forward(folder: Path):
-    vehicle = extended(folder, "rough_road", "rough_power")
-    for given in (None, 2.0):
-        run, _ = ride(vehicle, vibration=given)
-        series = run.series
-        told = None if given is None else np.where(series["speed"] > 0.5, given, 0.0)
-        energy = backward(vehicle, series["time"], series["speed"], RideConditions(vibration=told), smoothing=0.0)
-        for name in ("rough_road", "rough_power"):
-            assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02)
-
-
 # --- recorded rides -----------------------------------------------------------------------------------------------
 
 
@@ -116,18 +102,6 @@ def test_of_a_recorded_ride_it_is_what_the_accelerometer_shows(recorded: Recorde
     at = int(np.searchsorted(recorded.signals["distance"], middle))
     assert recorded.vibration is not None
     assert along_road(recorded.vibration)(middle) == pytest.approx(found[at], abs=0.2)
-
-
-def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
-    vehicle = extended(folder, "rough_road")
-    measured = per_second(recorded)
-    measured["grade"] = np.zeros(len(measured["speed"]))
-    more = road_load(vehicle, measured, 20.0, None) - road_load(BASE, measured, 20.0, None)
-    assert more == pytest.approx(NEWTONS * measured["vibration"])
-    assert measured["vibration"].std() > 0.05
-    del measured["vibration"]
-    more = road_load(vehicle, measured, 20.0, None) - road_load(BASE, measured, 20.0, None)
-    assert set(np.round(more, 6)) <= {0.0, round(NEWTONS * BASE.riding.vibration, 6)}
 
 
 # --- from a vehicle's file ----------------------------------------------------------------------------------------

@@ -309,11 +309,6 @@ def test_a_radius_that_only_the_odometer_doubts_cannot_be_told(rides, tmp_path, 
     assert said.looks is looks, said
 
 
-def test_a_gps_that_the_positions_contradict_is_named(rides):
-    (said,) = wrong_of(checked(rides[0], gps_speed=1.1))
-    assert said.roles == ("gps_speed",)
-
-
 # --- the pack ---------------------------------------------------------------------------------------------------------
 
 
@@ -338,16 +333,6 @@ def test_cells_that_give_current_above_their_full_voltage_are_too_few(rides, tmp
     (said,) = wrong_of(checked(rides[1], changed("cells_series", "12"), tmp_path, inverter_voltage=0.0))
     assert said.check == "voltage against the cells"
     assert "no more while they give current: 13 to 18 in series would fit" in said.text
-
-
-@pytest.mark.parametrize(("off", "looks"), [(0.0, Looks.RIGHT), (0.25, Looks.WRONG)])
-def test_a_gauge_that_falls_faster_than_voltage_and_charge_looks_wrong(rides, off, looks):
-    times, shown = rides[0].columns["bms_state_of_charge"]
-    late = times > times.mean()
-    columns = {**rides[0].columns, "bms_state_of_charge": (times, shown - off * late)}
-    found = [one for one in checked(replace(rides[0], columns=columns)) if "bms_state_of_charge" in one.roles]
-    assert any(one.looks is looks for one in found)
-    assert looks is Looks.WRONG or not wrong_of(found)
 
 
 @pytest.mark.parametrize(
@@ -376,13 +361,6 @@ def test_no_number_of_cells_fits_a_sensor_that_is_off(rides, role, scale):
         findings = checked(recorded, **{role: scale})
         assert any(role in one.roles for one in wrong_of(findings))
         assert [one.text for one in findings if "in series would fit" in one.text] == []
-
-
-def test_cells_that_the_daemon_cannot_predict_are_named(tmp_path):
-    for cells, looks in (13, Looks.WRONG), (14, Looks.RIGHT):
-        (tmp_path / "v.toml").write_text(changed("cells_series", str(cells)), encoding="utf-8")
-        (said,) = on_board(LOGS / "coastdown.blf", read_vehicle(tmp_path / "v.toml"), True, None)
-        assert (said.looks, said.roles) == (looks, ("pack_voltage",))
 
 
 @pytest.mark.parametrize(

@@ -153,11 +153,6 @@ def test_power_and_top_speed_are_what_is_entered(tmp_path):
     assert most.at(1.04 * fastest) == 0.0
 
 
-@pytest.mark.parametrize(("kind", "drift"), [("scooter", 0.055), ("motorcycle", 0.2), ("car", 0.2)])
-def test_what_goes_between_towns_differs_more_from_ride_to_ride(tmp_path, kind, drift):
-    assert read_vehicle(written(tmp_path, "nmc", "--kind", kind)).riding.drift == drift
-
-
 @pytest.mark.parametrize("there", ["nmc.toml", "nmc.dbc"])
 def test_it_writes_over_nothing(tmp_path, there, capsys):
     (tmp_path / there).write_text("mine", encoding="utf-8")

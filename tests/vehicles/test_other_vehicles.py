@@ -1,16 +1,9 @@
-"""Other vehicles than the reference scooter: a DBC and a TOML each, no code.
-
-Their layouts are tested on frames made here; on the frames that such vehicles really sent where GZ_ONBOARD_DATA
-names a folder that holds them (real/tlmoto_motostudent_kiro, real/can_logs).
-"""
+"""Other vehicles than the reference scooter: a DBC and a TOML each, no code; on frames made here."""
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import struct
-from bisect import bisect_left
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -19,7 +12,6 @@ import pytest
 from gz_onboard.can.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
 from gz_onboard.events import EFF_FLAG, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
-from gz_onboard.recording.logs import read_frames
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.events import Event, events_of
 
@@ -30,16 +22,6 @@ RPM = 2 * math.pi / 60
 
 def vehicle(name: str) -> Vehicle:
     return read_vehicle(str(HERE / name / f"{name}.toml"))
-
-
-def real(*names: str) -> Path:
-    folder = os.environ.get("GZ_ONBOARD_DATA")
-    if not folder:
-        pytest.skip("GZ_ONBOARD_DATA names no folder with real/: no frames of other vehicles")
-    path = Path(folder, "real", *names)
-    if not path.exists():
-        pytest.skip(f"{path} is missing: no frames of this vehicle")
-    return path
 
 
 def values(codec: Codec, events: Iterable[Event]) -> dict[str, list[tuple[float, float | None]]]:
@@ -115,57 +97,6 @@ def test_tlmoto_goes_the_whole_way():
     assert pipeline.counts().dropped == pipeline.counts().implausible == 0
 
 
-# column of the CSV: (role, unit of the column in the unit of the role, half a last digit)
-TLMOTO_TRUTH = {
-    "v_cap_V": ("inverter_voltage", 1.0, 1e-4),
-    "t_heatsink_C": ("inverter_temperature", 1.0, 1e-4),
-    "i_batt_A": ("pack_current", 1.0, 1e-4),
-    "torque_Nm": ("motor_torque", 1.0, 1e-4),
-    "motor_rpm": ("motor_speed", RPM, 1e-4),
-    "throttle_frac": ("throttle", 1.0, 1e-4),
-    "t_motor_C": ("motor_temperature", 1.0, 1e-4),
-    "v_batt_V": ("pack_voltage", 1.0, 1e-4),
-}
-# session: frames, events, signals out of range (the voltage as the contactors open)
-TLMOTO_SESSIONS = {
-    "kiro4": (30775, 11631, {("CTRL_Supply.CTRL_BatteryVoltage", RANGE): 1}),
-    "primeira_saida": (11151, 4693, {}),
-    "sakisaida2": (18598, 8467, {}),
-}
-
-
-@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
-def test_tlmoto_real_frames_against_what_others_decoded(session):
-    folder = real("tlmoto_motostudent_kiro")
-    codec = Codec(vehicle("tlmoto").mapping)
-    frames = [frame for batch in read_frames(folder / f"{session}.candump.log") for frame in batch]
-    events = events_of(codec, frames)
-    count, expected_events, faults = TLMOTO_SESSIONS[session]
-    assert (codec.received, len(events), codec.faults) == (count, expected_events, faults)
-    assert set(codec.unknown) == {0x0C, 0x32, 0x7B, 0x80}  # 12: voltages of the motor; 50, 123: nobody knows
-    start = frames[0][0] * 1e-9
-    decoded = values(codec, events)
-    with (folder / f"{session}.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    for column, (role, unit, digit) in TLMOTO_TRUTH.items():
-        times = [start + time for time, _ in decoded[role]]
-        compared = wrong = 0
-        for row in rows:
-            time = float(row["t_s"])
-            i = bisect_left(times, time - 0.005)
-            near = [
-                value
-                for t, (_, value) in zip(times[i : i + 3], decoded[role][i : i + 3], strict=True)
-                if t - time < 0.005
-            ]
-            if near:
-                compared += 1
-                truth = float(row[column]) * unit
-                wrong += not any(value is not None and abs(value - truth) <= digit for value in near)
-        assert compared > 0.9 * len(rows)
-        assert wrong <= faults.get(("CTRL_Supply.CTRL_BatteryVoltage", RANGE), 0) * (role == "pack_voltage"), column
-
-
 # --- a car's satellite receiver with valid bits -------------------------------------------------------------------
 
 
@@ -216,9 +147,3 @@ def test_truck_frames_of_its_layout():
         ("CCVS1", LENGTH): 1,
     }
     assert codec.unknown == {0x18F00E00 | EFF_FLAG: 1}
-
-
-# --- whole-second stamps and an empty line -------------------------------------------------------------------------
-
-
-# --- a car whose rides are real and whose frames are made here -------------------------------------------------------
