@@ -146,64 +146,57 @@ RELATIVE = {
 }
 
 
+# Of each effect but the wind: the field of `Hidden` that it changes, and the direction of the change; 0: either.
+FIELDS: dict[str, tuple[str, int]] = {
+    "cornering_drag": ("cornering", 1),
+    "rolling_resistance": ("rolling_factor", 1),
+    "aero_drag_area": ("drag_factor", 1),
+    "payload_mass": ("luggage", 1),
+    "dragging_brake": ("pad_force", 1),
+    "tyre_radius": ("radius_factor", 1),
+    "tyre_warm_up": ("warm_share", 1),
+    "drivetrain_drag": ("wheel_viscous", 1),
+    "auxiliary_load": ("auxiliary", 1),
+    "winding_resistance": ("copper", 1),
+    "torque_constant_loss": ("torque_factor", -1),
+    "inverter_loss": ("switching", 1),
+    "regen_loss": ("recovery_lost", 1),
+    "capacity_fade": ("capacity_factor", -1),
+    "resistance_growth": ("resistance_factor", 1),
+    "slow_relaxation": ("slow_resistance", 1),
+    "ocv_hysteresis": ("hysteresis", 1),
+    "cooling_blocked": ("cooling_factor", -1),
+    "current_sensor_offset": ("current_offset", 0),
+    "current_sensor_gain": ("current_factor", 0),
+    "voltage_sensor_offset": ("voltage_offset", 0),
+    "speed_scale": ("speed_factor", 0),
+    "sensor_latency": ("voltage_late", 1),
+}
+TIMES = {
+    "tyre_warm_up": ("warm_time", 450, 750),
+    "slow_relaxation": ("slow_time", 800, 1700),
+    "ocv_hysteresis": ("hysteresis_rate", 20, 45),
+}
+
+
 def _strength(rng: np.random.Generator, name: str) -> tuple[dict[str, float], tuple[float, ...]]:
     """The effect `name` of a random strength: what it sets in `Hidden`, and the change of its parameter."""
     _, _, weak, strong = EFFECTS[name]
     x = float(weak * (strong / weak) ** rng.random())
     sign = float(rng.choice([-1.0, 1.0]))
-    match name:
-        case "cornering_drag":
-            return {"cornering": x}, (x,)
-        case "headwind":
-            angle = rng.uniform(0, 2 * np.pi)
-            wind = (x * float(np.cos(angle)), x * float(np.sin(angle)))
-            return {"wind_north": wind[0], "wind_east": wind[1]}, wind
-        case "rolling_resistance":
-            return {"rolling_factor": 1 + x}, (x,)
-        case "aero_drag_area":
-            return {"drag_factor": 1 + x}, (x,)
-        case "payload_mass":
-            return {"luggage": x}, (x,)
-        case "dragging_brake":
-            return {"pad_force": x}, (x,)
-        case "tyre_radius":
-            x = -x if rng.random() < 0.8 else min(x, 0.02)
-            return {"radius_factor": 1 + x}, (x,)
-        case "tyre_warm_up":
-            return {"warm_share": x, "warm_time": float(rng.uniform(450, 750))}, (x,)
-        case "drivetrain_drag":
-            return {"wheel_viscous": x}, (x,)
-        case "auxiliary_load":
-            return {"auxiliary": x}, (x,)
-        case "winding_resistance":
-            return {"copper": x}, (x,)
-        case "torque_constant_loss":
-            return {"torque_factor": 1 - x}, (-x,)
-        case "inverter_loss":
-            return {"switching": x}, (x,)
-        case "regen_loss":
-            return {"recovery_lost": x}, (x,)
-        case "capacity_fade":
-            return {"capacity_factor": 1 - x}, (-x,)
-        case "resistance_growth":
-            return {"resistance_factor": 1 + x}, (x,)
-        case "slow_relaxation":
-            return {"slow_resistance": x, "slow_time": float(rng.uniform(800, 1700))}, (x,)
-        case "ocv_hysteresis":
-            return {"hysteresis": x, "hysteresis_rate": float(rng.uniform(20, 45))}, (x,)
-        case "cooling_blocked":
-            return {"cooling_factor": 1 - x}, (-x,)
-        case "current_sensor_offset":
-            return {"current_offset": sign * x}, (sign * x,)
-        case "current_sensor_gain":
-            return {"current_factor": 1 + sign * x}, (sign * x,)
-        case "voltage_sensor_offset":
-            return {"voltage_offset": sign * x}, (sign * x,)
-        case "speed_scale":
-            return {"speed_factor": 1 + sign * x}, (sign * x,)
-        case "sensor_latency":
-            return {"voltage_late": x}, (x,)
-    raise ValueError(name)
+    if name == "headwind":
+        angle = rng.uniform(0, 2 * np.pi)
+        wind = (x * float(np.cos(angle)), x * float(np.sin(angle)))
+        return {"wind_north": wind[0], "wind_east": wind[1]}, wind
+    changed, direction = FIELDS[name]
+    if name == "tyre_radius":
+        x = -x if rng.random() < 0.8 else min(x, 0.02)
+    x *= direction or sign
+    found = {changed: getattr(Hidden, changed) + x}
+    if name in TIMES:
+        other, low, high = TIMES[name]
+        found[other] = float(rng.uniform(low, high))
+    return found, (x,)
 
 
 def _unknown_strength(rng: np.random.Generator, name: str) -> tuple[dict[str, float], tuple[float, ...]]:
