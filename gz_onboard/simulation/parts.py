@@ -277,6 +277,7 @@ class FirstOrderPack:
         self.battery = battery
         self._effects, self._q = effects, {} if quantities is None else quantities
         self.effect_voltages: tuple[float, ...] = ()  # V of a cell, in the order of the effects
+        self._lost = 0.0  # V of a cell: their sum
         self.soc = soc
         self.v1 = v1  # V of a cell
         self._steps_left = 0  # until the tables are looked up again
@@ -313,7 +314,7 @@ class FirstOrderPack:
         n = battery.cells_series
         ocv, slope = battery.ocv_curve.extended(self.soc)
         ocv += self._shift
-        relaxing = n * (self.v1 + sum(self.effect_voltages))
+        relaxing = n * (self.v1 + self._lost)
         source = n * ocv - relaxing
         root = source * source - 4 * resistance * power
         current = 2 * power / (source + sqrt(root)) if root >= 0 else source / (2 * resistance)
@@ -327,6 +328,7 @@ class FirstOrderPack:
             q = self._q
             q["cell_current"], q["soc"] = current / battery.cells_parallel, self.soc
             self.effect_voltages = self._effects(q)
+            self._lost = sum(self.effect_voltages)
         return current, voltage, (middle - voltage) * current, voltage * current
 
     def chemical_energy_drawn(self) -> float:

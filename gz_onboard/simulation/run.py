@@ -162,12 +162,13 @@ def drive(
     end = finish if finish is not None else float("inf")
     kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
     rows, at = [(*states(scooter), nan)], [0]
-    drawn = array("d", (0.0, 0.0))  # current and voltage of each step
+    currents, voltages = array("d", (0.0,)), array("d", (0.0,))  # of the pack in each step
     done, empty, wanted = 0, False, nan
     for done in range(1, round(seconds / dt) + 1):
         throttle, brake, wanted = command(scooter)
         step(throttle, brake)
-        drawn.extend((scooter.current, scooter.voltage))
+        currents.append(scooter.current)
+        voltages.append(scooter.voltage)
         if not done % row_every:
             rows.append((*states(scooter), wanted))
             at.append(done)
@@ -181,7 +182,7 @@ def drive(
     if done % row_every:
         rows.append((*states(scooter), wanted))
         at.append(done)
-    current, voltage = np.frombuffer(drawn).reshape(-1, 2).T
+    current, voltage = np.frombuffer(currents), np.frombuffer(voltages)
     energy = np.cumsum(current * voltage) * dt
     columns = dict(zip((*_STATES, "wanted_speed"), np.array(rows, dtype=float).T, strict=True), energy=energy[at])
     steps = {name: columns[name] for name in COLUMNS}

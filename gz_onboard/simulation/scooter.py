@@ -91,8 +91,9 @@ class Scooter:
         self._set_surroundings(altitude, heading, vibration)
         self._build_electric(soc, ambient if cell_temperature is None else cell_temperature, pack, motor)
         self._build_mechanic(chassis)
-        self._names = [*self._force_names, *self._rolling_names, "turning", "dynamometer", "tyre_slip", "brakes"]
-        self._names += ["gearing", *self._loss_names, "bms", "battery_heat", "not_delivered", "idle", "charge"]
+        self._names = [*self._force_names, *self._rolling_names, *self._loss_names]
+        self._names += ["turning", "dynamometer", "tyre_slip", "brakes", "gearing"]
+        self._names += ["bms", "battery_heat", "not_delivered", "idle", "charge"]
         self._noted: list[tuple[Any, ...]] = []  # of each step since the last booking, by `_names`
         self._booked: dict[str, float] = dict.fromkeys(self._names, 0.0)  # J since the start; charge in A·s
         self._cooled = dict(self._booked)  # the same at the last step of the cooling networks
@@ -287,15 +288,25 @@ class Scooter:
 
         # --- and at the wheels
         turned = share * radius * w_mean + front_share * v_mean  # m/s, of the tyres
-        of_wheels = (
-            turning * v_mean,
-            absorbed * v_mean,
-            force * (radius * w_mean - v_mean),
-            braking * w_mean + front_braking * v_mean,
-            mechanical - drive * w_mean,
+        self._noted.append(
+            (
+                v_mean,
+                turned,
+                forces,
+                rolling,
+                losses,
+                turning * v_mean,
+                absorbed * v_mean,
+                force * (radius * w_mean - v_mean),
+                braking * w_mean + front_braking * v_mean,
+                mechanical - drive * w_mean,
+                bms,
+                pack_heat - bms,
+                -missing,
+                idle,
+                self.current,
+            )
         )
-        of_pack = (bms, pack_heat - bms, -missing, idle, self.current)
-        self._noted.append((v_mean, turned, forces, rolling, of_wheels, losses, of_pack))
         self._since_cooling += dt
         if self._since_cooling >= PERIOD - 1e-9:
             self._cool(self._since_cooling)
@@ -345,11 +356,12 @@ class Scooter:
         """Book the steps since the last booking."""
         if not self._noted:
             return
-        speed, turned, forces, rolling, *others = zip(*self._noted, strict=True)
+        speed, turned, forces, rolling, losses, *others = zip(*self._noted, strict=True)
         columns = [
             *(map(mul, column, speed) for column in zip(*forces, strict=True)),
             *(map(mul, column, turned) for column in zip(*rolling, strict=True)),
-            *(column for group in others for column in zip(*group, strict=True)),
+            *zip(*losses, strict=True),
+            *others,
         ]
         for name, powers in zip(self._names, columns, strict=True):
             self._booked[name] += sum(powers) * self.dt
