@@ -31,6 +31,7 @@ def any_value() -> Iterator[None]:
     """Signals play roles of other kinds here: what is plausible for those says nothing (test_plausible.py has it)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gz_onboard.can.layout.PLAUSIBLE", dict.fromkeys(PLAUSIBLE, (-math.inf, math.inf)))
+        patch.setattr("gz_onboard.can.layout.PLAUSIBLE_OF", {})
         yield
 
 
