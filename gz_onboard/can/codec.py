@@ -117,7 +117,7 @@ class MessageDecoder:
         return self._decode(frames, data, origin_ns) if self._roles else None
 
     def _from_own_place(self, frames: Sequence[Frame], origin_ns: int) -> list[Frame]:
-        own, origin = [], self.origin
+        kept, origin = [], self.origin
         assert origin
         for frame in frames:
             time_ns, identifier, data, channel = frame
@@ -125,10 +125,10 @@ class MessageDecoder:
             if origin.conflict:
                 self._codec.faults[self.name, CONFLICT] += 1
             elif is_own:
-                own.append(frame)
+                kept.append(frame)
             else:
                 self._codec.copies += 1
-        return own
+        return kept
 
     def _intact(self, frames: list[Frame], origin_ns: int) -> tuple[list[Frame], bytes]:
         """Drop frames with a wrong length, checksum or counter; return the others, and their data in one piece."""
@@ -231,7 +231,7 @@ class MessageDecoder:
 
 
 class Codec:
-    """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts.
+    """Decodes frames of one vehicle. Its state serves the checks: counters, the last time, the counts.
 
     All counts but `received` are those at the last call of `windows`.
     """
@@ -347,7 +347,7 @@ class Codec:
         return 0 if self.origin_ns is None else max(self.origin_ns + round(seconds * 1e9), 0)
 
     def clock_set(self, delta_ns: int) -> None:
-        """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
+        """The clock that stamps the frames was set by `delta_ns`; the timeline continues."""
         if self.origin_ns is not None:
             self.begin_at(self.origin_ns + delta_ns)
             self.last_ns += delta_ns
@@ -356,7 +356,7 @@ class Codec:
         """Take a time that does not follow the last one: True if the frame is to be used.
 
         One odd stamp is dropped. Several in a row that follow each other mean that the clock was set: back, or ahead by
-        more than the longest pause, and the timeline goes on from where it was; else ahead, and it is taken as a gap in
+        more than the longest pause, and the timeline continues; else ahead, and it is taken as a gap in
         the recording.
         """
         assert self.origin_ns is not None

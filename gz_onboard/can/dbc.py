@@ -55,20 +55,20 @@ _LOG = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).resolve().parent.parent
 
 
-def find_dbc(name: str, beside: Path | None = None) -> Path:
-    """The path of the DBC file `name`: in the folder `beside`, or one that comes with this package."""
-    places = [*([beside] if beside else []), _PACKAGE / "dbc", _PACKAGE.parent / "dbc"]
-    if found := next((place / name for place in places if is_file(place / name)), None):
+def find_dbc(name: str, folder: Path | None = None) -> Path:
+    """The path of the DBC file `name`: in `folder`, or one that comes with this package."""
+    folders = [*([folder] if folder else []), _PACKAGE / "dbc", _PACKAGE.parent / "dbc"]
+    if found := next((one / name for one in folders if is_file(one / name)), None):
         return found
     if Path(name).is_dir():
         raise InputError(f"{name}: is a folder; give the DBC file in it")
-    own = [file.name for place in places if place.is_dir() for file in place.glob("*.dbc")]
-    raise InputError(f"{name}: no such DBC file beside {beside or 'the vehicle file'} or in dbc/{nearest(name, own)}")
+    known = [file.name for one in folders if one.is_dir() for file in one.glob("*.dbc")]
+    raise InputError(f"{name}: no such DBC file in {folder or 'the current folder'} or in dbc/{nearest(name, known)}")
 
 
 def empty_database(strict: bool = True) -> Database:
     """A cantools database, to which DBC files are added; `strict`: signals must fit and may not overlap."""
-    logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are errors here
     with without(*_UNUSED):
         from cantools.database.can import Database
     return Database(strict=strict)

@@ -26,7 +26,7 @@ BLOCK_NS = 1_000_000_000
 
 MAGIC = MCAP0_MAGIC
 _CHUNK_BYTES = 256 * 1024
-_encode = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode  # `dumps` would make it anew each time
+_encode = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode  # `dumps` would make one for each sample
 _Sample: TypeAlias = tuple[int, int, bytes, int]  # channel, log time [ns], data, time of publishing [ns]
 
 FRAMES_TOPIC = "/can/frames"
@@ -75,7 +75,7 @@ class LogFile:
         self.flushed = False
         self.stream = stream
         self._pending: list[Frame] = []
-        self._held: list[_Sample] = []  # younger than the first of the pending frames
+        self._later: list[_Sample] = []  # younger than the first of the pending frames
         self._channels: dict[str, int] = {}
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"gz-onboard {__version__}")
@@ -106,7 +106,7 @@ class LogFile:
         """Log one JSON object on a declared topic; not-a-number and infinities become null.
 
         seen_ns: when it was so, if not at `time_ns`: the time of publishing, which may go back within a log. The time
-        of the log does not, as long as the clock is not set: what is younger than the first of the pending frames
+        of the log does not, as long as the clock is not set: a sample younger than the first of the pending frames
         waits for them.
         """
         try:
@@ -115,12 +115,12 @@ class LogFile:
             text = _encode(_without_nan(values))
         sample = self._channels[topic], time_ns, text.encode(), time_ns if seen_ns is None else seen_ns
         if self._pending and time_ns > self._pending[0][0]:
-            self._held.append(sample)
+            self._later.append(sample)
         else:
             self._writer.add_message(*sample)
 
     def note(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write a metadata record beside that of the beginning; `name` is another than ``gz_onboard``."""
+        """Write another metadata record; the one at the beginning is called ``gz_onboard``."""
         self._writer.add_metadata(name, {key: writable(text) for key, text in entries.items()})
 
     def flush(self, *, to_disk: bool = False) -> None:
@@ -152,16 +152,16 @@ class LogFile:
         block = self._pending[:count]
         self._writer.add_message(self._frames_channel, block[0][0], encode_block(block), publish_time=block[-1][0])
         del self._pending[:count]
-        held, self._held = sorted(self._held, key=itemgetter(1)), []
-        for sample in held:
+        later, self._later = sorted(self._later, key=itemgetter(1)), []
+        for sample in later:
             if self._pending and sample[1] > self._pending[0][0]:
-                self._held.append(sample)
+                self._later.append(sample)
             else:
                 self._writer.add_message(*sample)
 
 
 def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
-    """A JSON schema for an object of numbers, each with its unit; null stands for not available."""
+    """A JSON schema for an object of numbers, each with its unit; null means not available."""
     properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in units.items()}
     return {"title": title, "type": "object", "properties": properties}
 

@@ -219,8 +219,9 @@ def _protection(message: Message, options: Table) -> Protection:
     if found and (
         found.is_signed or found.conversion.is_float or found.multiplexer_ids is not None or not 2 <= found.length <= 32
     ):
-        said = f"{counter!r} must be an unsigned integer of 2 to 32 bits, in every {message.name}"
-        raise options.error(said, "counter")
+        raise options.error(
+            f"{counter!r} must be an unsigned integer of 2 to 32 bits, in every {message.name}", "counter"
+        )
     return Protection(crc or None, counter or None)
 
 
@@ -251,8 +252,8 @@ def _source(messages: Sequence[Message], left_out: LeftOut, roles: Table, role: 
     key = "signal" if table.values is roles.values[role] else ""
     for (message_name, signal_name), why in left_out.items():
         if signal_name == name and of in ("", message_name):
-            what = f"signal {shown(name)} of {message_name}"
-            raise table.error(f"{what} is left out of the DBC file, for it cannot be read: {why}", key)
+            place = f"{shown(name)} of {message_name}"
+            raise table.error(f"signal {place} is left out of the DBC file, for it cannot be read: {why}", key)
     among = [_message(messages, table, "message", of)] if of else messages
     found = [(m, s) for m in among for s in m.signals if s.name == name]
     if not found:
@@ -261,8 +262,7 @@ def _source(messages: Sequence[Message], left_out: LeftOut, roles: Table, role: 
         raise table.error(f"{where} {shown(name)}{nearest(name, known)}", key)
     if len(found) > 1:
         several = ", ".join(m.name for m, _ in found)
-        said = f"signal {shown(name)} stands in several messages ({several}): say which, by message = ..."
-        raise table.error(said, key)
+        raise table.error(f"signal {shown(name)} is in several messages ({several}): give one by message = ...", key)
     ((message, signal),) = found
     scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
     return _scaled(table, key, role, (message.name, name), signal.unit or "", (scale, offset))

@@ -262,7 +262,7 @@ def _delete(path: Path) -> None:
 class BackgroundRecorder:
     """Runs a `Recorder` on its own thread, so that the caller never waits for the disk.
 
-    What is logged is handed over at `sync`, twice a second and all at once: waking the thread costs as much as a
+    Frames and samples are handed over at `sync`, twice a second and all at once: waking the thread costs as much as a
     hundred frames. Beyond `MAX_WAITING` a whole portion is dropped, and its frames are counted in `lost_frames`. Nobody
     else may use the recorder.
     """

@@ -72,8 +72,8 @@ def read_requests(vehicle: Table, taken: Mapping[int, str]) -> tuple[Request, ..
         request = _request(table)
         for key, identifier in zip(_IDENTIFIERS, (request.request, request.response), strict=True):
             if identifier in taken:
-                said = f"{identifier & ~EFF_FLAG:#x} is that of message {taken[identifier]} of the DBC files"
-                raise table.error(said, key)
+                taken_by = f"message {taken[identifier]} of the DBC files"
+                raise table.error(f"{identifier & ~EFF_FLAG:#x} is that of {taken_by}", key)
         for other in requests:
             if request.name == other.name:
                 raise table.error(f"two requests are called {other.name}", "name")
@@ -173,7 +173,7 @@ def _first_byte(table: Table) -> int:
 class Assembler:
     """Assembles the answers on one identifier. address: the first byte of each frame, if it has one.
 
-    faults: counts (place, reason) of what is dropped.
+    faults: counts the answers that are dropped, by (place, reason).
     """
 
     def __init__(self, address: int | None, place: str, faults: Counter[tuple[str, str]]) -> None:

@@ -39,7 +39,7 @@ TREND_STEP, TREND_STEPS = 10.0, 60  # s between the ranges of the last ten minut
 NEARLY_EMPTY, NO_LONGER_EMPTY = 15.0, 17.0  # %: state of charge at which the alert begins, and ends
 CELL_HYSTERESIS = 2.0  # K: an alert about a cell ends this far within the limit
 NO_NEWS = "age_s", "counts", "vehicle_counts"
-"""Keys whose change alone is not shown at once."""
+"""Keys whose change alone makes no new picture."""
 ALERTS = (
     "bus_down",
     "silent",
