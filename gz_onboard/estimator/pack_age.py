@@ -116,9 +116,8 @@ def believe(as_new: float, new_sd: float, state: FilterState, resistance: float,
 def _posterior(mean: float, variance: float, precision: float, weighted: float) -> tuple[tuple[float, float], float]:
     """((mean, sd), logarithm of the evidence) of a normal prior and the likelihood exp(weighted·x - precision·x²/2)."""
     wide = 1 + variance * precision
-    evidence = (2 * mean * weighted + variance * weighted * weighted - mean * mean * precision) / (2 * wide) - log(
-        wide
-    ) / 2
+    fit = 2 * mean * weighted + variance * weighted * weighted - mean * mean * precision
+    evidence = fit / (2 * wide) - log(wide) / 2
     return ((mean + variance * weighted) / wide, sqrt(variance / wide)), evidence
 
 

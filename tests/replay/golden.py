@@ -26,7 +26,6 @@ from gz_onboard.vehicle import read_vehicle
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
 GOLDEN = Path(__file__).resolve().parent / "golden"
 EVERY = round(10.0 / WINDOW)  # estimates, thus 10 s
-WORST = 5  # rows told for each field
 
 Row = Mapping[str, str]
 
@@ -167,15 +166,12 @@ def differences(golden: Sequence[Row], now: Sequence[Row], tolerance: Mapping[st
 
 
 def told(found: Sequence[Difference], rows: int) -> str:
-    """The differences for a person: for each field how many rows differ, and the worst of them."""
+    """The differences for a person: for each field how many rows differ, and the largest difference."""
     lines: list[str] = []
     for name in dict.fromkeys(difference.field for difference in found):
-        of_field = sorted((d for d in found if d.field == name), key=lambda d: -d.size)
-        lines.append(f"{name}: {len(of_field)} of {rows} rows differ by more than {TOLERANCE.get(name, 0):g}")
-        lines.append(f"  {'time':>8}  {'golden':>16}  {'now':>16}  {'difference':>12}")
-        for d in of_field[:WORST]:
-            size = f"{float(d.now) - float(d.golden):+.4g}" if d.size < float("inf") else ""
-            lines.append(f"  {d.time:>8}  {d.golden or '-':>16}  {d.now or '-':>16}  {size:>12}")
-        if len(of_field) > WORST:
-            lines.append(f"  ... and {len(of_field) - WORST} more")
+        of_field = [difference for difference in found if difference.field == name]
+        worst = max(of_field, key=lambda difference: difference.size)
+        limit = TOLERANCE.get(name, 0.0)
+        count = f"{name}: {len(of_field)} of {rows} rows differ by more than {limit:g}"
+        lines.append(f"{count}, most at {worst.time} s: {worst.golden or '-'} before, {worst.now or '-'} now")
     return "\n".join(lines)
