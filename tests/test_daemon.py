@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
-import resource
 import shutil
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from itertools import count, pairwise
 from pathlib import Path
 from statistics import median
@@ -29,7 +28,7 @@ from gz_onboard.daemon.loop import Daemon
 from gz_onboard.errors import InputError
 from gz_onboard.events import TRANSMITTED, WINDOW, Frame, Reason, State
 from gz_onboard.recording.logs import read_frames, read_samples
-from tests.support import S, Scooter, check_frames, reference, ridden
+from tests.support import S, Scooter, check_frames, files_of_at_most, reference, ridden
 
 _NUMBERS = count()
 
@@ -114,21 +113,10 @@ def test_frames_in_frames_out(bus: str, tmp_path: Path):
     assert [f[1:3] for f in logged if f[3] & TRANSMITTED] == [f[1:3] for f in scene.heard]
 
 
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: writing fails as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_log_that_cannot_be_written_is_told_and_begun_again(bus: str, tmp_path: Path):
     recorder = Recorder(tmp_path, "v", limits=LogLimits(sync_s=0.2, retry_s=0.5))
     with Scene(bus, recorder=recorder) as scene:
-        with largest_file(8_000):
+        with files_of_at_most(8_000):
             failed: list[bool] = []  # that it was, once: half a second later it is tried again
 
             def has_failed() -> bool:

@@ -499,3 +499,15 @@ def test_a_page_that_the_dbc_does_not_list_keeps_the_signals_of_every_page(tmp_p
     rows = [row for _, _, row in Decoder(mapping).decode([frames])]
     assert [row["Cell[V]"] for row in rows] == [pytest.approx(3.7)] + [None] * 19
     assert all(row["Amps[A]"] == pytest.approx(-24.0) for row in rows)
+
+
+def test_the_mean_square_of_a_window_is_that_of_its_values(tmp_path):
+    dbc = 'BO_ 256 Imu: 2 A\n SG_ Up : 0|16@1- (0.01,-5) [0|0] "m/s^2" A\n'
+    codec = Codec(mapping_of(tmp_path, dbc, 'accel_z = "Up"'))
+    raw = [1500, 1400, 1475]
+    codec.decode([(i * MS, 256, struct.pack("<h", value), 0) for i, value in enumerate(raw)])
+    ((role,),) = [window.roles for window in codec.windows()]
+    values = [0.01 * value - 5 for value in raw]
+    assert role is not None
+    assert role.mean == pytest.approx(sum(values) / 3)
+    assert role.mean_square == pytest.approx(sum(value * value for value in values) / 3)

@@ -3,9 +3,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +16,7 @@ from gz_onboard.events import Frame
 from gz_onboard.recording import logs
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.readers.mcap import decode_block
+from tests.support import files_of_at_most
 
 START = 1_750_000_000_000_000_000  # 2025-06-15T15:06:40Z
 SECOND = 1_000_000_000
@@ -137,17 +135,6 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
     assert all(path.exists() for path in foreign)
     assert flat([read(path) for path in left]) == flat(batches)[-sum(len(read(path)) for path in left) :]
     assert log.errors == 0
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """The kernel refuses to let any file grow beyond this: like a full disk, an error in the middle of a write."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_write_error_is_counted_and_recording_resumes_with_a_new_file(tmp_path: Path) -> None:
