@@ -37,7 +37,7 @@ def main() -> None:
 
         for what, pairs in CELLS.items():
             counted(what, partial(test_pulse.away, pairs=pairs, scatter=SCATTER), given.cells)
-        for procedure in test_cooling.UNTOLD:
+        for procedure in test_cooling.FROM_PRIORS:
             counted(procedure.__name__, partial(test_cooling.away, procedure), given.networks)
 
 

@@ -53,7 +53,7 @@ def commands() -> Iterator[str]:
         yield f"- `{name}`: {procedure.what}"
         for slot, data in procedure.slots.items():
             key = "`DATA`" if slot == "data" else f"`--with {slot}=FILE`"
-            yield f"  - {key}: {data.what}{'' if data.least else ' (optional)'}"
+            yield f"  - {key}: {data.what}{'' if data.min_files else ' (optional)'}"
         yield from (f"  - `--set {option}={value}`" for option, value in number_options(name).items())
     yield "\n## Keys of JSON results"
     for of, version, keys in RESULTS:

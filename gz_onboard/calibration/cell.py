@@ -192,13 +192,13 @@ class SlowTestConfig:
     rest_at_begin: float = 60.0  # s: the same where the file begins with it, as what was before is not in it
     full_within: float = 0.01  # V: a charge that comes so near to the full cell's voltage is complete
     unexplained: float = 0.03  # of capacity: what efficiency and tester leave between the branches at most
-    most_apart: float = 0.1  # of capacity: branches further apart are not of one cell between the same ends
+    max_difference: float = 0.1  # of capacity: branches further apart are not of one cell between the same ends
     alike: float = 1.5  # ratio of the branches' currents below which both move the voltage alike
     switched: float = 120.0  # s after switching the current: where its step is read
     longest_switch: float = 1000.0  # s: a longer gap shows no step
     resistance_sd: float = 0.2  # relative: of steady current, out of that of its steps
-    least_slope: float = 1e-3  # V over all of SOC: what a flat or falling part is given
-    least_step: float = 2e-5  # V from node to node: twice the last digit that a vehicle file holds
+    min_slope: float = 1e-3  # V over all of SOC: what a flat or falling part is given
+    min_step: float = 2e-5  # V from node to node: twice the last digit that a vehicle file holds
     voltmeter_sd: float = 5e-4  # V: no tester's voltage is surer
     unrested_sd: float = 0.02  # V: of a full cell's voltage that is not one at rest
     above_cutoff: float = 0.2  # V: at C/8 or slower a nearly empty cell is that near its open-circuit voltage
@@ -343,9 +343,9 @@ def _paired(sweep: OcvSweep, result: Result) -> OcvSweep:
         why = f"the charge at {current:.3g} A is no counterpart of the discharge at {sweep.current:.3g} A"
     elif abs(share - 1) <= c.unexplained or (share < 1 and reached <= sweep.full - c.full_within):
         return sweep
-    elif share > 1 + c.most_apart:
+    elif share > 1 + c.max_difference:
         raise test.table.error(
-            f"{counts}, over {100 * c.most_apart:.0f} % more: the discharge did not begin full or end empty, or a "
+            f"{counts}, over {100 * c.max_difference:.0f} % more: the discharge did not begin full or end empty, or a "
             "current is wrong"
         )
     else:
@@ -474,8 +474,8 @@ def _monotonic(value: Array, result: Result, name: str) -> Array:
 
 def increasing(soc: Array, volts: Array) -> Array:
     """`volts` (n,) at `soc` (n,), raised where they fall or are flat, so that they increase when rounded too."""
-    least = np.maximum(SLOW_TEST.least_slope * np.diff(soc), SLOW_TEST.least_step)
-    line = np.concatenate([[0.0], np.cumsum(least)])
+    rise = np.maximum(SLOW_TEST.min_slope * np.diff(soc), SLOW_TEST.min_step)
+    line = np.concatenate([[0.0], np.cumsum(rise)])
     return np.asarray(np.maximum.accumulate(volts - line) + line)
 
 

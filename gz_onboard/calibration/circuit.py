@@ -46,7 +46,7 @@ class PairFitConfig:
     bend_sd: float = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
     shift_sd: float = 0.01  # V: rest voltage of this test against the OCV
     shift_sd_empty: float = 0.05  # V: the same below 10 % SOC
-    least: float = 2e-5  # ohm: of a pair that the data do not show; with the longest time its C1 fits a file
+    min_resistance: float = 2e-5  # ohm: of a pair that the data do not show; with the longest time its C1 fits a file
     left_out: tuple[float, float] = (0.1, 1.0)  # of a piece's weight, to see how much hangs on it: see `jackknife`
 
 
@@ -343,19 +343,19 @@ class Reduction:
         many = np.column_stack([load, *map(relaxing, TIMES), *([relaxing(slow[1])] if slow else [])])
         gram = many.T @ many
         self._times = np.geomspace(3, 300, 50)
-        solved, left = [], []
+        solved, residual_gram = [], []
         for tau in self._times.tolist():
             one = np.column_stack([load, relaxing(tau)])
             cross = one.T @ many
             best = np.linalg.solve(one.T @ one, cross)
             solved.append(best)
-            left.append(gram - cross.T @ best)
-        self._solved, self._left = np.array(solved), np.array(left)
+            residual_gram.append(gram - cross.T @ best)
+        self._solved, self._residual_gram = np.array(solved), np.array(residual_gram)
 
     def logs(self, resistances: Array) -> Array:
         """(n, 3): ln of R0, R1 and τ1, for `resistances` (1 + len(TIMES), n) [ohm]."""
         resistances = np.vstack([resistances, np.tile(np.reshape(self._slow, (-1, 1)), resistances.shape[1])])
-        costs = np.einsum("kin,in->nk", self._left @ resistances, resistances)
+        costs = np.einsum("kin,in->nk", self._residual_gram @ resistances, resistances)
         solutions = np.moveaxis(self._solved @ resistances, -1, 0)
         return np.array([self._nearest(*row) for row in zip(costs, solutions, strict=True)])
 
@@ -365,7 +365,7 @@ class Reduction:
         if np.any(positive):
             cost = np.where(positive, cost, np.inf)
         else:  # there is nothing that a pair could follow
-            solution = np.maximum(solution, PAIR_FIT.least)
+            solution = np.maximum(solution, PAIR_FIT.min_resistance)
         k = int(np.argmin(cost))
         found, time = solution[k], np.log(self._times[k])
         if 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):  # between the times, by a parabola

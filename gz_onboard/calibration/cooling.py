@@ -44,9 +44,8 @@ class CoolingConfig:
     block: float = 300.0  # s: errors within it depend on each other
     many: int = 6  # runs, from which on whole runs are the independent pieces
     known_share: float = 0.5  # of its prior's sd: a value less sure than this leans on the prior
-    airflow_sure: float = 2.0  # sd
     entropy_sd: float = 5e-4  # V/K: lithium-ion cells are within ±0.5 mV/K unless empty (Viswanathan 2010)
-    board_least: float = 0.25  # of the resistance of bars, fuse and BMS that is in the BMS: transistors and shunt
+    board_min_share: float = 0.25  # of the resistance of bars, fuse and BMS that is in the BMS: transistors and shunt
 
 
 CONFIG = CoolingConfig()
@@ -334,16 +333,18 @@ def _bounds(name: str, value: float) -> tuple[float, float]:
 
 def _usable(runs: Sequence[CoolingRun], sensor: str, result: Result) -> list[CoolingRun]:
     """The runs with that sensor in which it changes enough; the others are noted. InputError for none."""
-    good, least = [], CONFIG.cell_rise if sensor == "cell_temperature" else CONFIG.rise
+    good, min_change = [], CONFIG.cell_rise if sensor == "cell_temperature" else CONFIG.rise
     for run in runs:
         if sensor not in run.measured:
             result.notes.append(f"{run.name}: no {sensor}, left out")
-        elif (rise := float(np.ptp(run.measured[sensor]))) < least:
+        elif (rise := float(np.ptp(run.measured[sensor]))) < min_change:
             result.notes.append(f"{run.name}: {sensor} changes by {rise:.1f} K only, left out")
         else:
             good.append(run)
     if not good:
-        raise InputError(f"no run tells anything of {sensor}: it is not measured, or changes by less than {least:g} K")
+        raise InputError(
+            f"no run tells anything of {sensor}: it is not measured, or changes by less than {min_change:g} K"
+        )
     return good
 
 
@@ -376,14 +377,7 @@ def _solve(
         unit = _UNITS.get(name.rpartition("_")[2], "W/K")
         result.parameters[name] = found.found(name, unit, f"{_source(runs)}; rms {rms:.2g} K", further)
     result.covariance.append((tied, found.part(tied) + np.diag(more) ** 2))
-    if (name := network.per_speed) in found.names:
-        still, sure = name.replace("per_speed", "to_ambient"), found[name] > CONFIG.airflow_sure * found.sd(name)
-        result.notes.append(
-            f"{still}: {found[still]:.2f} ± {found.sd(still):.2f} W/K in still air, and {found[name]:.3f} ± "
-            f"{found.sd(name):.3f} W/K more for each m/s of moving air"
-            f"{'' if sure else ', which is not distinguishable from none'}"
-        )
-    elif name:
+    if (name := network.per_speed) and name not in found.names:
         result.refusals.append(f"{name}: no air moved in any of the runs: {values[name]:g} W·s/(K·m) of the file stays")
     return found
 
@@ -531,15 +525,15 @@ def bms_cooling(
 
 
 def board_resistance(vehicle: Vehicle) -> tuple[float, float]:
-    """(value, sd) of bms_resistance [ohm]: `CoolingConfig.board_least` to all of the measured pack_series_resistance.
+    """(value, sd) of bms_resistance [ohm]: `board_min_share` to all of the measured pack_series_resistance.
 
-    Where that is not measured, the file's own.
+    Where that is not measured, the value of the file.
     """
     known = vehicle.parameters.known
     series = known["pack_series_resistance"]
     if series.status != "measured":
         return known["bms_resistance"].value, known["bms_resistance"].sd
-    share, share_sd = (1 + CONFIG.board_least) / 2, (1 - CONFIG.board_least) / 12**0.5
+    share, share_sd = (1 + CONFIG.board_min_share) / 2, (1 - CONFIG.board_min_share) / 12**0.5
     return share * series.value, float(np.hypot(share_sd * series.value, share * series.sd))
 
 

@@ -22,7 +22,7 @@ from gz_onboard.calibration.table import Measurements
 from gz_onboard.model.effects import inverter_loss, motor_copper_loss, motor_iron_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
-SURE = 3.0  # sd, of a copper loss that grows with speed or a constant that falls with current
+SIGNIFICANCE = 3.0  # sd, of a copper loss that grows with speed or a constant that falls with current
 TORQUE_SD = 0.02  # relative: a point's torque is not known better than to this share of the greatest torque
 WARMED = 30.0  # K between points that tell a temperature coefficient
 FEWEST_POINTS = 12
@@ -175,7 +175,7 @@ def solve(bench: Bench, use: Mask) -> Solution:
     turn[-1] /= resistance
     turn[-1, free.names.index("motor_copper_resistance")] = -product / resistance**2
     covariance = turn @ free.covariance @ turn.T
-    if product > SURE * free.sd(FREQUENCY):
+    if product > SIGNIFICANCE * free.sd(FREQUENCY):
         return replace(free, value=np.append(free.value[:-1], product / resistance), covariance=covariance)
     alone = np.zeros_like(covariance)
     alone[:-1, :-1], alone[-1, -1] = plain.covariance, covariance[-1, -1]
@@ -227,9 +227,12 @@ def torque_constant(dyno: Measurements, largest_current: float = RIDING_CURRENT)
     )
     systematic = _fall_with_current(bench, found, model, result)
     result.parameters["torque_constant"] = found.found("torque_constant", "N·m/A", source, systematic)
-    i, left, order = bench.current, bench.torque - model, np.argsort(bench.current)
+    i, residual, order = bench.current, bench.torque - model, np.argsort(bench.current)
     constant = PlotLine("torque constant", i[order], found["torque_constant"] * i[order])
-    used, beyond = PlotLine("used", i[use], left[use], "."), PlotLine("beyond the range", i[~use], left[~use], "x")
+    used, beyond = (
+        PlotLine("used", i[use], residual[use], "."),
+        PlotLine("beyond the range", i[~use], residual[~use], "x"),
+    )
     lines = PlotLine("measured", i, bench.torque, "."), constant
     result.panels.append(Panel("Shaft torque", CURRENT, "torque [N·m]", lines))
     result.panels.append(Panel("Shaft torque: residual", CURRENT, "measured less model [N·m]", (used, beyond)))
@@ -241,7 +244,7 @@ def _fall_with_current(bench: Bench, found: Solution, model: Array, result: Resu
     i, constant = bench.current, found["torque_constant"]
     saturation = linear({"small": i, "fall": i**3}, bench.torque + constant * i - model)
     small, fall, largest = saturation["small"], saturation["fall"], float(np.max(np.abs(i)))
-    if abs(fall) <= SURE * saturation.sd("fall"):
+    if abs(fall) <= SIGNIFICANCE * saturation.sd("fall"):
         return 0.0
     result.notes.append(
         f"torque over current falls with current: {small:.4f} N·m/A at small, {small + fall * largest**2:.4f} at "

@@ -25,14 +25,14 @@ Option = float | str | Mapping[str, float | str]
 class Slot:
     """The files of one kind that a procedure takes.
 
-    kind: "table", "ride", or "any": CSV and Parquet are tables then. least: of files, 0 for a slot that may be left
-    out. most: None for any number.
+    kind: "table", "ride", or "any": CSV and Parquet are tables then. min_files: 0 for a slot that may be left out.
+    max_files: None for any number.
     """
 
     kind: str
     what: str
-    least: int = 0
-    most: int | None = None
+    min_files: int = 0
+    max_files: int | None = None
 
     def is_table(self, file: Path) -> bool:
         """Whether `file` is read as a table, not as a ride."""

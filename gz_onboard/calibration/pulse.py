@@ -64,20 +64,24 @@ class PulseConfig:
 
     fewest_pulses: int = 6
     fewest_levels: int = 3  # states of charge with a long rest
-    least_drawn: float = 0.5  # of the slow test's capacity
-    most_drawn: float = 1.3  # of the slow test's capacity: more is another cell
+    min_drawn: float = 0.5  # of the slow test's capacity
+    max_drawn: float = 1.3  # of the slow test's capacity: more is another cell
     rest: float = 1200.0  # s without current, after which a voltage is that of rest
     full_within: float = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
-    untold: float = 0.03  # relative sd of a capacity that the rests do not tell: they lie where the OCV is flat
+    capacity_sd_limit: float = (
+        0.03  # relative sd of a capacity that the rests do not tell: they lie where the OCV is flat
+    )
     taken_sd: float = 0.1  # relative: of the slow test's capacity where it is taken for another temperature
-    apart: float = 0.03  # relative: how far the capacities of a pulse test and a slow test may differ unsaid
+    capacity_difference: float = (
+        0.03  # relative: how far the capacities of a pulse test and a slow test may differ unsaid
+    )
     nearest: float = 2.0  # K between two tests
     level_slope: float = 0.15  # relative: how far a time constant may change over 0.1 of SOC
     pooled: float = 0.1  # of SOC: how far the scatter of pulses is taken to be alike
     smooth: float = 0.08  # relative: how far ln of a table may bend over 0.1 of SOC, where the data say little
-    rests_sure: float = 0.99  # how surely the rests must show that temperature moves them
+    rests_confidence: float = 0.99  # how surely the rests must show that temperature moves them
     slow_time: float = 300.0  # s: slower pairs are the effect `slow_relaxation`; one for riding has a minute
-    sure: float = 3.0  # sd that a resistance is above zero, before the file gets its effect
+    significance: float = 3.0  # sd that a resistance is above zero, before the file gets its effect
     reaction_chance: float = 1e-3  # that tests without charge transfer show as much
     reaction_share: float = 0.3  # of R0 in the warmest test: where the search begins
     reaction_time_sd: float = 1.5  # of ln time, before the pulses
@@ -182,7 +186,7 @@ def _tests(tables: Sequence[Measurements], ocv: Curve, capacity: Found, result: 
                 f"{cold.test.table.file} and {warm.test.table.file} are both at {warm.temperature:g} degC: one of them"
             )
     rated = tests[_nearest_to_bench(tests)]
-    if abs(rated.capacity / capacity.value - 1) > PULSE.apart:
+    if abs(rated.capacity / capacity.value - 1) > PULSE.capacity_difference:
         result.notes.append(
             f"{rated.test.name}: the rests ask for a capacity of {rated.capacity:.3f} A·h at {rated.temperature:g} "
             f"degC, cell_capacity is {capacity.value:.3f}: another cell, an aged one, or tests between other ends. "
@@ -210,7 +214,7 @@ def _tested(table: Measurements, ocv: Curve, capacity: Found, result: Result) ->
         result.notes.append(f"{test.name}: begins at {test.voltage[0]:.3f} V, SOC {start:.3f}, not full")
     drawn, at_rest = test.drawn[rests], test.voltage[rests]
 
-    def misses(share: float) -> Array:
+    def rest_errors(share: float) -> Array:
         """How far the rests lie off the OCV [V], those above 0.12 of SOC and less their common offset."""
         level = start - drawn / (share * capacity.value)
         error = at_rest - extended_over(nodes, volts, level)
@@ -218,12 +222,12 @@ def _tested(table: Measurements, ocv: Curve, capacity: Found, result: Result) ->
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
         return np.asarray(np.sqrt(weight) * (error - offset))
 
-    share = float(minimize_scalar(lambda x: float(np.sum(misses(x) ** 2)), bounds=(0.6, 1.15), method="bounded").x)
-    error = misses(share)
-    curvature = (np.sum((misses(share + 1e-3) - error) ** 2)) / 1e-6
+    share = float(minimize_scalar(lambda x: float(np.sum(rest_errors(x) ** 2)), bounds=(0.6, 1.15), method="bounded").x)
+    error = rest_errors(share)
+    curvature = (np.sum((rest_errors(share + 1e-3) - error) ** 2)) / 1e-6
     sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
     temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
-    if sd > c.untold:
+    if sd > c.capacity_sd_limit:
         result.refusals.append(
             f"{test.name}: the rests at {temperature:g} degC lie where the open-circuit voltage is flat and do not "
             f"tell the capacity (± {100 * sd:.0f} %): that of the slow test is taken, ± {100 * c.taken_sd:.0f} %"
@@ -250,9 +254,9 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
         raise table.error(
             f"rests of {c.rest / 60:.0f} min at {len(levels)} states of charge; at least {c.fewest_levels} are needed"
         )
-    if used > c.most_drawn * capacity.value:
+    if used > c.max_drawn * capacity.value:
         raise table.error(f"{draws}: more than the cell holds. Is it the cell of the slow test, and the current in A?")
-    if used < c.least_drawn * capacity.value:
+    if used < c.min_drawn * capacity.value:
         raise table.error(f"{draws}: pulses over at least half of the range of SOC are needed")
     return rests
 
@@ -280,7 +284,9 @@ def _moved_pieces(tests: Sequence[Tested], nodes: Array, volts: Array) -> list[P
     slopes = []
     for part in (slice(0, 1), slice(1, None)):
         size = np.array([np.median(np.sum(f.resistance[part][:, MIDDLE], axis=0)) for f in fitted])
-        seen = size.min() > PAIR_FIT.least  # charge transfer may leave nothing of R0, whose activation nobody sees then
+        seen = (
+            size.min() > PAIR_FIT.min_resistance
+        )  # charge transfer may leave nothing of R0, whose activation nobody sees then
         slopes.append(np.clip(np.gradient(np.log(size), inverse), 0, 8000) if seen else np.zeros(len(size)))
     return split([(float(a), float(b)) for a, b in zip(*slopes, strict=True)])
 
@@ -311,21 +317,21 @@ def _charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, names:
 
     def cost(x: Array) -> float:
         doubt = (x[1] - known[1].prior) / known[1].prior_sd, (x[2] - np.log(known[2].prior)) / c.reaction_time_sd
-        return sum(left(reaction(x)) for left in costs) + float(np.sum(np.square(doubt)))
+        return sum(residual(reaction(x)) for residual in costs) + float(np.sum(np.square(doubt)))
 
-    size = max(np.median(first[-1][0]), PAIR_FIT.least)
+    size = max(np.median(first[-1][0]), PAIR_FIT.min_resistance)
     start = np.array([np.log(c.reaction_share * size), known[1].prior, np.log(known[2].prior)])
     simplex = start + np.vstack([np.zeros(3), np.diag(10 * REACTION_STEPS)])
     options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.1, "maxfev": c.reaction_trials}
     found = minimize(cost, start, method="Nelder-Mead", options=options)
     free = sum(len(t.test) for t in tests) / PAIR_FIT.correlated
-    left, none = float(found.fun), sum(left(NO_REACTION) for left in costs)
+    best_cost, no_reaction_cost = float(found.fun), sum(residual(NO_REACTION) for residual in costs)
     values, vectors = np.linalg.eigh(_curvature(cost, found.x))
-    spread = 2 * max(left / free, 1.0) / np.maximum(values, np.finfo(float).tiny)  # endless where nothing bends it
+    spread = 2 * max(best_cost / free, 1.0) / np.maximum(values, np.finfo(float).tiny)  # endless where nothing bends it
     sd = np.sqrt(vectors**2 @ spread)
-    chance = float(f_distribution.sf((none - left) / 3 / (left / free), 3, free))
+    chance = float(f_distribution.sf((no_reaction_cost - best_cost) / 3 / (best_cost / free), 3, free))
     best = reaction(found.x)
-    result.effects[CHARGE_TRANSFER] = seen = chance <= c.reaction_chance and 0 < sd[0] < 1 / c.sure
+    result.effects[CHARGE_TRANSFER] = seen = chance <= c.reaction_chance and 0 < sd[0] < 1 / c.significance
     if not seen:
         result.notes.append(
             "no resistance that falls with current is seen: the pulses need several currents to show it"
@@ -334,7 +340,7 @@ def _charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, names:
     result.notes.append(
         f"resistance falls with current: {1e3 * best.resistance:.3g} mΩ of charge transfer at 25 degC and no current, "
         f"activation {best.activation:.0f} K, settling in {best.time:.2g} s; without "
-        f"it what is left is {np.sqrt(none / left):.2f} times as large"
+        f"it what is left is {np.sqrt(no_reaction_cost / best_cost):.2f} times as large"
     )
     sds = best.resistance * float(sd[0]), float(sd[1]), best.time * float(sd[2])
     for parameter, value, doubt in zip(known, (best.resistance, best.activation, best.time), sds, strict=True):
@@ -496,7 +502,7 @@ def _shift_of_rests(temperature: Array, shifts: Array, sds: Array, reference: in
         f"{1e3 * m:+.1f} ± {1e3 * s:.1f} mV at {t:g} degC"
         for t, m, s in zip(temperature[others], mean[others], sd[others], strict=True)
     )
-    if chance > 1 - PULSE.rests_sure:
+    if chance > 1 - PULSE.rests_confidence:
         result.notes.append(
             f"rests do not move with temperature beyond how they scatter over the state of charge: {moves}; "
             "the open-circuit voltage is one for all temperatures"
@@ -531,7 +537,7 @@ def _slow_relaxation(
     ohm, log = np.concatenate(tables), np.concatenate(times)
     value, doubt = float(np.median(ohm)), float(np.sqrt(np.sum(np.square(doubts)))) / len(doubts)
     if (
-        value < c.sure * doubt or value * capacity < PAIR_FIT.voltage_sd
+        value < c.significance * doubt or value * capacity < PAIR_FIT.voltage_sd
     ):  # at a current of 1 C, more than the fit leaves
         result.notes.append(f"no slow relaxation is told from the rest: {1e3 * value:.2g} ± {1e3 * doubt:.2g} mΩ")
         return None

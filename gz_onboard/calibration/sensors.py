@@ -48,13 +48,13 @@ class RideConfig:
     auxiliary: float = 0.85  # A of lamps and control, by which the auxiliary sensor's class counts
     drift_sd: float = 0.02  # A of a current sensor's zero from day to day: the least believed
     first_spread: float = 0.05  # A: the same of one ride
-    least_apart: float = 0.01  # V that two voltage sensors of a pack may differ by, however alike they read
+    min_voltage_offset_sd: float = 0.01  # V that two voltage sensors of a pack may differ by, however alike they read
     # resistances
     cable_window: float = 1.0  # s
     cable_span: float = 10.0  # A, for a line
     voltage_gain_sd: float = 1e-3  # of each sensor: a gain over the sag of the pack looks like resistance
     step_time: float = 0.2  # s
-    least_step: float = 15.0  # A
+    min_step: float = 15.0  # A
     fewest_steps: int = 20
     warm: float = 20.0  # degC: below the cells' resistance is many times that of bars and fuse
     cells_sd: float = 0.05  # of the cells' resistance, from cell to cell and from table to step
@@ -289,7 +289,7 @@ def offsets(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
     volts = float(np.mean([x.mean_at_rest(x.pack_voltage - x.inverter_voltage) for x in resting]))
     result.parameters["pack_voltage_offset"] = Found(
         0.0,
-        max(abs(volts), RIDE.least_apart * sizes.voltage),
+        max(abs(volts), RIDE.min_voltage_offset_sd * sizes.voltage),
         "V",
         f"reads {volts:+.3f} V over the inverter's at rest, {len(resting)} rides; which one errs is unknown",
     )
@@ -316,26 +316,30 @@ def _offset(result: Result, resting: Sequence[PackReadings], vehicle: Vehicle, p
         return
     p, sizes = vehicle.parameters, sizes_of(vehicle)
     loss, loss_sd = p["inverter_loss_constant"], p.sd("inverter_loss_constant")
-    apart = np.array([x.mean_at_rest(x.pack - x.inverter - x.others) for x in resting])
-    own = np.array([loss / x.mean_at_rest(x.pack_voltage) for x in resting])
-    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else RIDE.first_spread * sizes.current
+    differences = np.array([x.mean_at_rest(x.pack - x.inverter - x.others) for x in resting])
+    inverter_own = np.array([loss / x.mean_at_rest(x.pack_voltage) for x in resting])
+    spread = (
+        float(np.std(differences - inverter_own, ddof=1)) if len(differences) > 1 else RIDE.first_spread * sizes.current
+    )
     scatter = max(spread, RIDE.drift_sd * sizes.current)
     auxiliary = RIDE.shunt_sd * RIDE.auxiliary * sizes.auxiliary / sizes.voltage
     sd = float(np.hypot(scatter, loss_sd / resting[0].pack_voltage.mean()) + auxiliary)
     source = (
-        f"{len(resting)} rides at rest: pack less {'inverter less ' if paired else ''}auxiliary is {apart.mean():+.3f} "
-        f"± {spread:.3f} A, {own.mean():.3f} A of it the inverter's own {loss:.1f} W"
+        f"{len(resting)} rides at rest: pack less {'inverter less ' if paired else ''}auxiliary is "
+        f"{differences.mean():+.3f} ± {spread:.3f} A, {inverter_own.mean():.3f} A of it the inverter's own {loss:.1f} W"
     )
     channel = f"pack_current less {'inverter_current and ' if paired else ''}auxiliary_current at rest"
-    result.parameters["pack_current_offset"] = Found(float(np.mean(apart - own)), sd, "A", source, channel)
+    result.parameters["pack_current_offset"] = Found(
+        float(np.mean(differences - inverter_own)), sd, "A", source, channel
+    )
 
 
-def _gain(result: Result, readings: Sequence[PackReadings], least: float) -> None:
-    """The pack's current over inverter's and auxiliary together, by ride, if they span `least` [A]."""
+def _gain(result: Result, readings: Sequence[PackReadings], min_span: float) -> None:
+    """The pack's current over inverter's and auxiliary together, by ride, if they span `min_span` [A]."""
     name = "pack_current_gain"
     rows = [[x.means(column, RIDE.window) for column in (x.inverter + x.others, x.pack)] for x in readings]
     (x, y), labels = (np.concatenate(c) for c in zip(*rows, strict=True)), _labels([row[0] for row in rows])
-    if np.ptp(x) < least:
+    if np.ptp(x) < min_span:
         result.refusals.append(f"{name}: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
         return
     found, model = line(name, x, y, as_groups(labels))
@@ -418,13 +422,13 @@ def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses:
     refusal instead of a number where the cells' own doubt is greater than what is left.
     """
     c, result, name = RIDE, Result("resistance"), "pack_series_resistance"
-    by_temperature, least = cell_steps(pulses), c.least_step * sizes_of(vehicle).current
-    of_rides = [_ride_steps(ride, vehicle, by_temperature, least, result) for ride in rides]
+    by_temperature, min_step = cell_steps(pulses), c.min_step * sizes_of(vehicle).current
+    of_rides = [_ride_steps(ride, vehicle, by_temperature, min_step, result) for ride in rides]
     steps = [columns for columns in of_rides if columns is not None]
     count = sum(len(di) for di, _, _ in steps)
     if count < c.fewest_steps:
         raise InputError(
-            f"{count} steps of more than {least:g} A within {c.step_time:g} s above {c.warm:g} degC are "
+            f"{count} steps of more than {min_step:g} A within {c.step_time:g} s above {c.warm:g} degC are "
             f"too few for {name}; {c.fewest_steps} are needed"
         )
     di, dv, cell = (np.concatenate(column) for column in zip(*steps, strict=True))
@@ -432,7 +436,7 @@ def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses:
     value, sd = found["series"], float(np.hypot(found.sd("series"), c.cells_sd * float(cell.mean())))
     whole = linear({"whole": di}, dv)["whole"]
     source = (
-        f"{len(di)} steps above {least:g} A within {c.step_time:g} s of {len(steps)} rides above {c.warm:g} degC: "
+        f"{len(di)} steps above {min_step:g} A within {c.step_time:g} s of {len(steps)} rides above {c.warm:g} degC: "
         f"{1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of the pulse tests' steps"
     )
     model = (cell + value) * di
@@ -450,11 +454,11 @@ def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses:
 
 
 def _ride_steps(
-    ride: Recording, vehicle: Vehicle, by_temperature: tuple[Array, Array], least: float, result: Result
+    ride: Recording, vehicle: Vehicle, by_temperature: tuple[Array, Array], min_step: float, result: Result
 ) -> tuple[Array, Array, Array] | None:
     """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
 
-    None for a ride without steps above `least` [A], or at a temperature at which the cells' part is too large or not
+    None for a ride without steps above `min_step` [A], or at a temperature at which the cells' part is too large or not
     known.
     """
     c, battery = RIDE, vehicle.pack
@@ -472,7 +476,7 @@ def _ride_steps(
     voltage = np.interp(time, *columns["pack_voltage"])
     stride = max(round(c.step_time / float(np.median(np.diff(time)))), 1)
     step, drop = current[stride:] - current[:-stride], -(voltage[stride:] - voltage[:-stride])
-    big = np.abs(step) > least
+    big = np.abs(step) > min_step
     if not big.any():
         return None
     cell_ohm = float(np.exp(np.interp(temperature, *by_temperature)))

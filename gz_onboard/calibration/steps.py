@@ -106,10 +106,10 @@ def _wrong_files(name: str, files: Mapping[str, Sequence[Path]]) -> tuple[str, s
     """(slot, why) of files by slot that the procedure `name` cannot take; None if it can."""
     for slot, needed in PROCEDURES[name].slots.items():
         count = len(files.get(slot, ()))
-        if count < needed.least:
-            return slot, f"{name} needs {needed.what} ({slot}: {needed.least} or more), has {count}"
-        if needed.most is not None and count > needed.most:
-            return slot, f"{name} takes {needed.most} for {slot} ({needed.what}), has {count}"
+        if count < needed.min_files:
+            return slot, f"{name} needs {needed.what} ({slot}: {needed.min_files} or more), has {count}"
+        if needed.max_files is not None and count > needed.max_files:
+            return slot, f"{name} takes {needed.max_files} for {slot} ({needed.what}), has {count}"
     fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
     for file in sorted(fitted & held):
         return "held_out", f"names {file.name}, which is in data too: a file cannot be both fitted and held out"
@@ -176,10 +176,10 @@ def read_manifest(data: Sequence[Path], vehicle: str | Path | None = None) -> tu
     if not steps:
         raise table.error(f"names no procedure; there are {', '.join(PROCEDURES)}")
     try:
-        own = find_vehicle(table.check_path("vehicle", table.text("vehicle", "reference")), folder=file.parent)
+        named = find_vehicle(table.check_path("vehicle", table.text("vehicle", "reference")), folder=file.parent)
     except InputError as error:
         raise table.error(str(error), "vehicle") from error
-    return find_vehicle(vehicle) if vehicle else own, steps
+    return find_vehicle(vehicle) if vehicle else named, steps
 
 
 def _manifest_step(table: Table, name: str) -> Step:
@@ -192,8 +192,8 @@ def _manifest_step(table: Table, name: str) -> Step:
     columns: dict[str, dict[str, Named]] = {}
     options: dict[str, Option] = {}
     for slot in files:
-        own = f"{slot}_columns"
-        if named := read_columns(table.table(own if own in table.values else "columns")):
+        key = f"{slot}_columns"
+        if named := read_columns(table.table(key if key in table.values else "columns")):
             columns[slot] = named
     for key in (key for key in defaults if key in table.values):
         value = table.values[key]

@@ -100,12 +100,12 @@ def copied_effects(effects: Iterable[Effect], out: Path) -> dict[tuple[str, ...]
 
     Returns nothing if all `effects` belong to the package.
     """
-    own = [file for file in (effect.file for effect in effects) if file.resolve().parent != PACKAGE_EFFECTS]
-    if not own:
+    user_files = [file for file in (effect.file for effect in effects) if file.resolve().parent != PACKAGE_EFFECTS]
+    if not user_files:
         return {}
     folder = out.with_name(f"{out.stem}_effects")
     folder.mkdir(exist_ok=True)
-    for file in own:
+    for file in user_files:
         if file.resolve().parent != folder.resolve():
             shutil.copyfile(file, folder / file.name)
     return {("model", "effects_folder"): folder.name}

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from gz_onboard.calibration.table import Measurements
-
-DATA = os.environ.get("GZ_ONBOARD_DATA")
-needs_data = pytest.mark.skipif(not DATA, reason="the recordings are not in the repository: set GZ_ONBOARD_DATA")
-
-
-def bench_file(name: str) -> Path:
-    return Path(DATA or "") / "bench" / name
 
 
 def table(**columns) -> Measurements:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
+from gz_onboard.calibration.cell import open_circuit
 from gz_onboard.calibration.table import Measurements
 
 
@@ -96,6 +98,19 @@ def slow_test(charge=1.0, hours=20, **plant):
     if charge:
         pieces += [(-current, seconds * charge, 60), (0.0, 600, 60)]
     return cell.run(pieces, name="ocv.csv"), cell
+
+
+@cache
+def slow_curve():
+    """Open-circuit voltage and capacity that the slow test of a `Plant` gives."""
+    result = open_circuit(slow_test()[0])
+    return result.curves["battery.ocv"], result.parameters["cell_capacity"]
+
+
+def changed(table, **columns):
+    """`table` with columns changed by functions of themselves."""
+    new = {name: change(table.columns[name].copy()) for name, change in columns.items()}
+    return replace(table, columns={**table.columns, **new})
 
 
 def pulse_pieces(capacity=2.5, levels=10, sizes=(1.0, 2.5, 5.0)):

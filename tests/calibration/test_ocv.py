@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gz_onboard.calibration.cell import OCV_SOC, open_circuit
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
-from tests.calibration.cells import Plant, slow_test
+from tests.calibration.cells import Plant, changed, slow_test
 
 
 @given(capacity=st.floats(1, 5), r0=st.floats(0.01, 0.08), hysteresis=st.floats(0, 0.01), seed=st.integers(0, 1000))
@@ -36,11 +36,7 @@ def test_hysteresis_is_in_the_sd():
     assert np.median(much[middle]) > np.median(little[middle]) + 0.006
 
 
-def changed(**columns):
-    table = slow_test()[0]
-    return replace(table, columns={**table.columns, **{k: f(table.columns[k].copy()) for k, f in columns.items()}})
-
-
+SLOW = slow_test()[0]
 FULL, DOWN, REST, UP = (0, 600, 60), (0.125, 72000, 60), (0, 3600, 60), (-0.125, 72000, 60)
 
 
@@ -58,7 +54,7 @@ def full_early():
         (slow_test(charge=0)[0], "no charge branch", 0.006),
         (slow_test(charge=0.5)[0], r"no charge branch at SOC 0\.55? to 0\.99", 0.006),
         (full_early(), "the branches do not close", 0.006),
-        (changed(current=lambda c: np.where(c < 0, 0.94 * c, c)), "brings back 2.350 of 2.500", 0.006),
+        (changed(SLOW, current=lambda c: np.where(c < 0, 0.94 * c, c)), "brings back 2.350 of 2.500", 0.006),
         (Plant().run([FULL, DOWN, REST, (-1.25, 7200, 60), FULL], name="ocv.csv"), "1.25 A is no counterpart", 0.006),
         (Plant(soc=0.0).run([FULL, UP, REST, DOWN, REST], name="ocv.csv"), "", 0.003),
     ],
@@ -97,17 +93,17 @@ def backwards():
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        (changed(current=lambda c: -c), "ocv.csv:13: the voltage falls .* discharging must be positive"),
+        (changed(SLOW, current=lambda c: -c), "ocv.csv:13: the voltage falls .* discharging must be positive"),
         (backwards(), "as charge is drawn, .* discharging must be positive"),
-        (changed(current=lambda c: 0 * c), "no current flows"),
-        (changed(time=lambda t: np.where(t > 30000, t + 9000, t)), "a gap of 9060 s while a current"),
-        (changed(voltage=lambda v: np.maximum(v, 3.6)), "it is clipped"),
+        (changed(SLOW, current=lambda c: 0 * c), "no current flows"),
+        (changed(SLOW, time=lambda t: np.where(t > 30000, t + 9000, t)), "a gap of 9060 s while a current"),
+        (changed(SLOW, voltage=lambda v: np.maximum(v, 3.6)), "it is clipped"),
         (slow_test(hours=3)[0], "the discharge takes 3.0 h"),
-        (changed(voltage=lambda v: np.where(np.arange(len(v)) == 500, 0.0, v)), "ocv.csv:501: voltage is 0 V"),
-        (changed(current=lambda c: np.where(c < 0, 1.25 * c, c)), r"brings back 3.\d+ of 2.500 A·h.*10 %"),
+        (changed(SLOW, voltage=lambda v: np.where(np.arange(len(v)) == 500, 0.0, v)), "ocv.csv:501: voltage is 0 V"),
+        (changed(SLOW, current=lambda c: np.where(c < 0, 1.25 * c, c)), r"brings back 3.\d+ of 2.500 A·h.*10 %"),
         (Plant().run(PIECES, name="ocv.csv"), r"ocv.csv: 2.5\d* A·h are drawn in pieces.* 1.5\d* of it without a"),
         (Measurements(Path("ocv.csv"), {"time": np.arange(9.0), "current": np.ones(9)}), "no column for 'voltage'"),
-        (replace(slow_test()[0], columns={k: v[:20] for k, v in slow_test()[0].columns.items()}), "20 samples are too"),
+        (replace(SLOW, columns={k: v[:20] for k, v in SLOW.columns.items()}), "20 samples are too"),
     ],
 )
 def test_what_is_no_slow_test_is_refused(table, words):

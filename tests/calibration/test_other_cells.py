@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from gz_onboard.calibration.table import Measurements
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import OWN, read_vehicle
-from tests.calibration.cells import Plant, pulse_pieces, pulse_test, slow_test
+from tests.calibration.cells import Plant, pulse_pieces, pulse_test, slow_curve, slow_test
 
 REFERENCE = OWN / "reference.toml"
 
@@ -29,12 +28,9 @@ class Flat(Plant):
         return 3.3 + 0.02 * soc - 0.9 * np.exp(-soc / 0.02) + 0.15 * np.exp(-(1 - soc) / 0.01)
 
 
-def flat_test(hours=20, cell=None):
-    cell = cell or Flat(hysteresis=0.02)
-    current, seconds = cell.capacity / hours, hours * 3600
-    return cell.run(
-        [(0, 600, 60), (current, seconds, 60), (0, 3600, 60), (-current, seconds, 60), (0, 600, 60)], name="flat.csv"
-    )
+def flat_test():
+    steps = [(0, 600, 60), (0.125, 72000, 60), (0, 3600, 60), (-0.125, 72000, 60), (0, 600, 60)]
+    return Flat(hysteresis=0.02).run(steps, name="flat.csv")
 
 
 def written(folder, *results):
@@ -109,12 +105,6 @@ def test_a_step_that_fails_leaves_the_report_of_those_before(tmp_path, capsys):
     assert not out.exists()
 
 
-@cache
-def slow():
-    result = bench.open_circuit(slow_test()[0])
-    return result.curves["battery.ocv"], result.parameters["cell_capacity"]
-
-
 def test_pulses_on_a_flat_curve_take_the_capacity_of_the_slow_test(tmp_path):
     flat = bench.open_circuit(flat_test())
     table = Flat(hysteresis=0.02).run(pulse_pieces(levels=6), name="flat.csv")
@@ -128,10 +118,10 @@ def test_pulses_on_a_flat_curve_take_the_capacity_of_the_slow_test(tmp_path):
 
 
 def test_pulses_of_another_capacity_than_the_slow_test_are_told():
-    curve, capacity = slow()
+    curve, capacity = slow_curve()
     found = pulse.calibrate_cell([pulse_test(25.0, 6)[0]], curve, replace(capacity, value=2.7))
     assert re.search(r"pulse_25C.csv: .* 2.5\d+ A·h at 25 degC, cell_capacity is 2.700", " ".join(found.notes))
-    assert "cell_capacity" not in " ".join(pulse.calibrate_cell([pulse_test(25.0, 6)[0]], *slow()).notes)
+    assert "cell_capacity" not in " ".join(pulse.calibrate_cell([pulse_test(25.0, 6)[0]], *slow_curve()).notes)
 
 
 @pytest.mark.parametrize(
@@ -149,4 +139,4 @@ def test_a_wrong_unit_is_named(column, factor, more, words):
     table = replace(table, file=table.file.with_name("cell.csv"))
     table.columns[column] = table.columns[column] * factor + more
     with pytest.raises(InputError, match=words):
-        pulse.calibrate_cell([table], *slow())
+        pulse.calibrate_cell([table], *slow_curve())

@@ -11,27 +11,21 @@ import pytest
 from scipy.signal import lfilter
 
 from gz_onboard.calibration import pulse
-from gz_onboard.calibration.cell import cell_test, open_circuit
+from gz_onboard.calibration.cell import cell_test
 from gz_onboard.calibration.circuit import follow_profile, riding_current, voltage
 from gz_onboard.calibration.pulse import Residual, voltage_errors
 from gz_onboard.calibration.result import Result
 from gz_onboard.calibration.table import Measurements
 from gz_onboard.errors import InputError
-from tests.calibration.cells import MANY, Plant, nearest_pair, pulse_pieces, pulse_test, slow_test
+from tests.calibration.cells import MANY, Plant, changed, nearest_pair, pulse_pieces, pulse_test, slow_curve, slow_test
 
 INSIDE = (pulse.SOC > 0.12) & (pulse.SOC < 0.95)
 
 
 @cache
-def slow():
-    result = open_circuit(slow_test()[0])
-    return result.curves["battery.ocv"], result.parameters["cell_capacity"]
-
-
-@cache
 def found(seed=0, pairs=((0.03, 30.0),), temperatures=(0.0, 25.0), levels=10):
     tables = [pulse_test(t, levels, seed=seed + k, pairs=pairs)[0] for k, t in enumerate(temperatures)]
-    return pulse.calibrate_cell(tables, *slow())
+    return pulse.calibrate_cell(tables, *slow_curve())
 
 
 def test_what_was_planted_comes_back_within_its_uncertainty():
@@ -54,7 +48,7 @@ def away(seed, pairs=((0.03, 30.0),), scatter=0.03):
         pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=scatter, pairs=pairs)[0]
         for k, t in enumerate((0.0, 25.0))
     ]
-    result = pulse.calibrate_cell(tables, *slow())
+    result = pulse.calibrate_cell(tables, *slow_curve())
     loads = [riding_current(seed=k) for k in range(1, 4)]
     given = (
         [tuple(result.parameters[name].value for name in ("slow_resistance", "slow_time"))]
@@ -79,7 +73,7 @@ def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says():
 def resting(rest, seed):
     """Of a cell whose rest voltage falls by `rest` [V/K] below 25 degC, and by what the tester's noise makes of it."""
     return pulse.calibrate_cell(
-        [pulse_test(t, seed=seed + k, rest=rest)[0] for k, t in enumerate((-5.0, 10.0, 25.0))], *slow()
+        [pulse_test(t, seed=seed + k, rest=rest)[0] for k, t in enumerate((-5.0, 10.0, 25.0))], *slow_curve()
     )
 
 
@@ -167,8 +161,8 @@ def test_the_tester_s_counter_bridges_gaps():
         return replace(t, columns={k: v[keep] for k, v in t.columns.items()})
 
     with pytest.raises(InputError, match="what was drawn meanwhile is not known"):
-        pulse.calibrate_cell([without(table)], *slow())
-    result = pulse.calibrate_cell([without(counted)], *slow())
+        pulse.calibrate_cell([without(table)], *slow_curve())
+    result = pulse.calibrate_cell([without(counted)], *slow_curve())
     assert result.curves["battery.r0"].value[0, INSIDE] == pytest.approx(0.05, rel=0.03)
 
 
@@ -177,33 +171,31 @@ def under_load(table):
     return replace(table, columns={name: column[begin:] for name, column in table.columns.items()})
 
 
-def changed(**columns):
-    table = pulse_test()[0]
-    return replace(table, columns={**table.columns, **{k: f(table.columns[k].copy()) for k, f in columns.items()}})
+PULSES = pulse_test()[0]
 
 
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
         ([], "no pulse test"),
-        ([changed(current=lambda c: -c)], r"pulse_25C.csv:\d+: the voltage falls .* discharging must be positive"),
-        ([changed(voltage=lambda v: np.minimum(v, 3.9))], "clipped"),
+        ([changed(PULSES, current=lambda c: -c)], r"25C.csv:\d+: the voltage falls .* discharging must be positive"),
+        ([changed(PULSES, voltage=lambda v: np.minimum(v, 3.9))], "clipped"),
         ([slow_test()[0]], "has 2 pulses; at least 6"),
-        ([replace(changed(), columns={k: v[:1500] for k, v in changed().columns.items()})], "states of charge; at"),
-        ([changed(), changed()], "are both at 25 degC"),
+        ([replace(PULSES, columns={k: v[:1500] for k, v in PULSES.columns.items()})], "states of charge; at"),
+        ([PULSES, PULSES], "are both at 25 degC"),
         ([Plant(capacity=1.0).run(pulse_pieces(1.0), name="other.csv")], "at least half of the range"),
         ([under_load(pulse_test(25.0, 5)[0])], r"begins under a current of 1 A.*at rest"),
     ],
 )
 def test_what_is_no_pulse_test_is_refused(tables, words):
     with pytest.raises(InputError, match=words):
-        pulse.calibrate_cell(tables, *slow())
+        pulse.calibrate_cell(tables, *slow_curve())
 
 
 def test_a_start_below_full_is_said():
     cell = Plant(soc=0.85)
     table = cell.run(pulse_pieces(2.0, 8), 25.0, "late.csv")
-    result = pulse.calibrate_cell([table], *slow())
+    result = pulse.calibrate_cell([table], *slow_curve())
     assert any("SOC 0.8" in note and "not full" in note for note in result.notes)
     assert result.curves["battery.r0"].value[0, 8] == pytest.approx(0.05, rel=0.03)
     assert any("0.05, 1 at 25 degC" in text for text in result.refusals)
@@ -215,7 +207,7 @@ PLANTED = 0.015
 @cache
 def reacting(reaction):
     tests = [pulse_test(t, 6, seed=k, reaction=reaction)[0] for k, t in enumerate((-10.0, 10.0, 25.0))]
-    return pulse.calibrate_cell(tests, *slow())
+    return pulse.calibrate_cell(tests, *slow_curve())
 
 
 def test_it_is_found_with_its_temperature_and_time():
