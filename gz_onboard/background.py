@@ -9,6 +9,8 @@ from collections.abc import Callable
 from queue import Queue
 from typing import Any
 
+STUCK_S = 10.0  # no disk takes as long
+
 log = logging.getLogger("gz-onboard")
 
 
@@ -47,10 +49,11 @@ class Background:
         return self._weight / self._limit
 
     @property
-    def stuck(self) -> float:
-        """For how long [s] the present call has been running; 0 if there is none."""
+    def error(self) -> str:
+        """Why waiting calls may never be made: the present one takes longer than any disk; empty if none does."""
         began = self._began
-        return 0.0 if began is None else time.monotonic() - began
+        is_stuck = began is not None and time.monotonic() - began > STUCK_S
+        return "the disk does not answer" if is_stuck else ""
 
     def wait(self, seconds: float) -> bool:
         """Wait until all calls are done; False if they are not within `seconds`."""

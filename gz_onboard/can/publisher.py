@@ -184,10 +184,10 @@ def range_messages(file: Path) -> dict[str, Message]:
 @cache  # a vehicle makes several publishers
 def _range_messages(file: Path, text: str) -> dict[str, Message]:
     found = {message.name: message for message in database_of([(file, text)]).messages}
-    own = find_dbc(RANGE_DBC)
-    if file == own:
+    standard_file = find_dbc(RANGE_DBC)
+    if file == standard_file:
         return found
-    standard = range_messages(own)
+    standard = range_messages(standard_file)
     for name, wanted in standard.items():
         if name not in found:
             raise InputError(f"{file}: has no message {name}, which {RANGE_DBC} has{nearest(name, found)}")

@@ -25,7 +25,6 @@ from gz_onboard.state import sync_directory
 
 _NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d{1,9}))?\.mcap")
 MAX_WAITING = 40_000  # frames for the disk; each value of a sample counts as one
-_STUCK_S = 10.0  # no disk takes as long
 PORTION_NS = 450_000_000  # between two portions that the thread gets: every fifth tick, also if one comes early
 _LEFT_FREE = 64 << 20  # bytes
 _LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with the DBC files
@@ -172,7 +171,7 @@ class Recorder:
         self._directory.mkdir(parents=True, exist_ok=True)
         self._make_room()
         start = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
-        number = max((number for number, _, _ in self._own()), default=0) + 1
+        number = max((number for number, _, _ in self._log_files()), default=0) + 1
         path = self._directory / f"{start}_{self._vehicle}{'' if number == 1 else f'~{number}'}.mcap"
         self._stream = path.open("xb")
         self.paths.append(path)
@@ -184,14 +183,14 @@ class Recorder:
         self._synced_ns, self._failed_ns, self._file = start_ns, None, file
         return file
 
-    def _own(self) -> list[tuple[int, str, Path]]:
+    def _log_files(self) -> list[tuple[int, str, Path]]:
         """Running number, start and path of the files named as ours, the oldest first."""
         found = [(match, path) for path in self._directory.iterdir() if (match := _NAME.fullmatch(path.name))]
         return sorted((int(match[3] or 1), match[1], path) for match, path in found if path.is_file())
 
     def _make_room(self) -> None:
         """Delete our oldest files until a new one of full size fits. OSError if it cannot, on a full disk."""
-        for _, _, path in self._own():
+        for _, _, path in self._log_files():
             if not path.stat().st_size:  # a power cut came before the first sync
                 _delete(path)
         total = self._total_bytes()
@@ -204,11 +203,11 @@ class Recorder:
         self._delete_oldest(lambda: self._total_bytes() <= allowed)
 
     def _total_bytes(self) -> int:
-        return sum(path.stat().st_size for _, _, path in self._own())
+        return sum(path.stat().st_size for _, _, path in self._log_files())
 
     def _delete_oldest(self, is_enough: Callable[[], bool]) -> bool:
         """Delete our oldest files, but for the one being written, until `is_enough`; False if it never is."""
-        for _, _, path in self._own():
+        for _, _, path in self._log_files():
             if is_enough():
                 return True
             if self._file is None or path != self.path:
@@ -285,7 +284,7 @@ class BackgroundRecorder:
             return self._recorder.last_error
         if self._is_full:
             return "the disk is too slow"
-        return "the disk does not answer" if self._thread.stuck > _STUCK_S else ""
+        return self._thread.error
 
     @property
     def lost_frames(self) -> int:

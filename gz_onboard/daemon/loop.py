@@ -37,7 +37,6 @@ CLOCK_STEP_NS = 500_000_000
 HELD_NS = 200_000_000  # a channel waits no longer for another that could not be read out
 SAVE_PERIOD_NS, SAVE_AT_MOST_NS = 10_000_000_000, 1_000_000_000
 SAVE_SOC = 0.001  # a change of the state of charge that is saved before the period is over
-STATE_STUCK_S = 10.0  # after which a disk that has not yet saved the state does not answer
 
 log = logging.getLogger("gz-onboard")
 
@@ -226,7 +225,7 @@ class StateKeeper:
     @property
     def error(self) -> str:
         """Why the state cannot be saved; empty if it can."""
-        return "the disk does not answer" if self._thread.stuck > STATE_STUCK_S else self._error
+        return self._thread.error or self._error
 
     def restore(self, pipeline: Pipeline, make: Callable[[], Pipeline]) -> tuple[Pipeline, Mapping[str, Any] | None]:
         """Restore the newest copy that can be used into `pipeline`; return the pipeline to use, and the snapshot.
