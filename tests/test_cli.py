@@ -166,24 +166,6 @@ def test_the_daemon_runs_no_effects_but_roots(
     assert "no such folder" in refused(capsys, *arguments, "--effects", str(tmp_path / "none"))
 
 
-@pytest.mark.parametrize(
-    ("right", "wrong", "said"),
-    [
-        ("BO_ 512 BMS_Pack: 8 BMS", "BO_ 512 BMS_Pack: 8", "line"),
-        ("SG_ BMS_PackCurrent : 16|16@1-", "SG_ BMS_PackCurrent : 16|16@1", "line"),
-        ("SG_ BMS_PackCurrent : 16|16@1-", "SG_ BMS_PackCurrent : 8|16@1-", "BMS_Pack"),
-    ],
-)
-def test_dbc(capsys: pytest.CaptureFixture[str], tmp_path: Path, right: str, wrong: str, said: str):
-    dbc = (ROOT / "dbc" / "vehicle.dbc").read_text(encoding="utf-8")
-    assert right in dbc
-    (tmp_path / "vehicle.dbc").write_text(dbc.replace(right, wrong), encoding="utf-8")
-    (tmp_path / "mine.toml").write_text(VEHICLE, encoding="utf-8")
-    err = refused(capsys, "run", "--interface", "virtual", "--channel", "a", "--vehicle", str(tmp_path / "mine.toml"))
-    assert "vehicle.dbc" in err
-    assert said in err
-
-
 @pytest.mark.parametrize("name", ["none.blf", "empty.blf", "noise.blf", "noise.mcap", "noise.log.gz", "noise.log"])
 @pytest.mark.parametrize("command", ["replay", "estimate", "validate", "export", "simulate", "discover"])
 def test_log(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str, name: str):

@@ -25,11 +25,10 @@ from gz_onboard.pipeline import Pipeline, range_publisher
 from gz_onboard.processes import Task
 from gz_onboard.progress import Progress
 from gz_onboard.recording.decode import decode_columns, feed
-from gz_onboard.recording.frames import FrameColumns, SignalColumns
+from gz_onboard.recording.frames import FrameColumns, SignalColumns, on_timeline
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.recording import check_ridden, of_ride, open_ride
 from gz_onboard.recording.tables import SignalTable
-from gz_onboard.recording.timeline import on_timeline
 from gz_onboard.reports.results import FIRST_DATE_NS
 from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle

@@ -7,16 +7,13 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.events import Frame
 from gz_onboard.export.decoder import Decoder, column_name
 from gz_onboard.recording import logs
-
-if TYPE_CHECKING:
-    from cantools.database.can import Message
 
 _TEXT_FORMATS = (".log", ".asc", ".trc", ".csv", ".jsonl")
 _FORMATS = (*_TEXT_FORMATS, ".blf", ".mf4", ".parquet", ".mcap")
@@ -99,7 +96,8 @@ def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Fr
             file.channel(topic, json.loads(schema), of_channel)
         for message in decoder.all_messages:
             if topics[message.name] not in recorded:
-                file.channel(topics[message.name], _message_schema(message))
+                texts = {column_name(s): ", ".join(filter(None, (s.unit or "", s.comment))) for s in message.signals}
+                file.channel(topics[message.name], object_schema(message.name, texts))
 
         def logged() -> Iterator[list[Frame]]:
             file.frames(first)
@@ -116,8 +114,3 @@ def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Fr
             count += 1
         file.close()
     return count
-
-
-def _message_schema(message: Message) -> dict[str, Any]:
-    texts = {column_name(s): ", ".join(filter(None, (s.unit or "", s.comment))) for s in message.signals}
-    return object_schema(message.name, texts)

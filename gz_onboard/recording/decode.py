@@ -24,8 +24,7 @@ from gz_onboard.can.mapping import Source
 from gz_onboard.events import ERR_FLAG, RTR_FLAG, SQUARED, Frame, MessageWindow, RoleWindow
 from gz_onboard.pipeline import TICK_NS, WINDOW_NS, Pipeline
 from gz_onboard.progress import Progress
-from gz_onboard.recording.frames import FrameColumns, SignalColumns
-from gz_onboard.recording.timeline import on_timeline, stray
+from gz_onboard.recording.frames import FrameColumns, SignalColumns, on_timeline, stray
 
 if TYPE_CHECKING:
     from cantools.database.can import Message

@@ -15,11 +15,10 @@ from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, hexadecimal
 from gz_onboard.options import MOST_PAYLOAD
 from gz_onboard.recording.decode import decode_columns
-from gz_onboard.recording.frames import BATCH, FrameColumns, SignalColumns
+from gz_onboard.recording.frames import BATCH, FrameColumns, SignalColumns, stray
 from gz_onboard.recording.logs import is_table, log_stem, read_log
 from gz_onboard.recording.readers.contents import LogDamage
 from gz_onboard.recording.tables import SignalTable, read_table, table_signals
-from gz_onboard.recording.timeline import stray
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:

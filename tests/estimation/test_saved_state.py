@@ -24,7 +24,7 @@ from gz_onboard.can.recorder import is_complete
 from gz_onboard.cli import main
 from gz_onboard.daemon import loop
 from gz_onboard.daemon.loop import Daemon
-from gz_onboard.estimation.ride import open_estimate, state_for
+from gz_onboard.estimation.ride import open_estimate
 from gz_onboard.events import Frame
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.logs import read_frames
@@ -179,15 +179,6 @@ def test_a_log_that_was_cut_in_two_is_two_rides(cuts, tmp_path, capsys):
     assert estimate(tmp_path, tmp_path) == 0
     rides = json.loads((tmp_path / "said.json").read_text())["rides"]
     assert [ride["saved_state_age_s"] for ride in rides] == [None, 0.0]
-
-
-def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
-    frames = cuts["c"]
-    begin, half = frames[0][0], frames[len(frames) // 2][0]
-    write_log(tmp_path / "set.mcap", [(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames])
-    span = state_for(tmp_path / "s.json", open_estimate(tmp_path / "set.mcap", reference()), {})
-    assert span.end_ns == frames[-1][0]
-    assert span.begin_ns == pytest.approx(begin, abs=0.1 * S)
 
 
 # --- what is refused ---------------------------------------------------------------------------------------------

@@ -23,8 +23,7 @@ from gz_onboard.daemon.loop import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.recording.decode import feed
-from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.timeline import stray
+from gz_onboard.recording.frames import FrameColumns, stray
 from gz_onboard.vehicle import Vehicle
 from tests.events import events_of
 from tests.hardening import Report

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.can.codec import CONFIRM
 from gz_onboard.events import Frame
-from gz_onboard.recording.frames import FrameColumns
-from gz_onboard.recording.timeline import stray
+from gz_onboard.recording.frames import FrameColumns, stray
 from tests.support import EPOCH, MS, S
 
 

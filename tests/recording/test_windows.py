@@ -12,7 +12,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.can.codec import TIME
 from gz_onboard.can.mapping import BusMapping, read_mapping
 from gz_onboard.events import TRANSMITTED, Frame, MessageWindow, Reason
 from gz_onboard.log_rows import STATUS_TOPIC
@@ -153,16 +152,3 @@ def test_frames_that_are_dropped_and_lost_are_told_in_the_second_in_which_they_w
     run = assert_alike(reference().mapping, arriving(frames))
     told = [e.time for e in run.estimates if e.reasons & (Reason.FRAMES_LOST | Reason.FRAMES_DROPPED)]
     assert told == pytest.approx([2.1, 2.6, 3.1, 3.6, 4.1, 4.6])
-
-
-def test_the_clock_may_be_set_within_a_log() -> None:
-    """The windows go on as if it had not been, and the samples of the log have the times of its frames."""
-    frames = Scooter().steady(10.0)
-    later = [(f[0] + (3600 * S if f[0] >= EPOCH + 5 * S else 0), *f[1:]) for f in frames]
-    run = Stepped(reference().mapping)
-    run.pipeline.codec.longest_pause_ns = 60 * S
-    feed(run.pipeline, FrameColumns.of(later))
-    assert [e.time for e in run.estimates] == pytest.approx([0.1 + 0.5 * k for k in range(20)])
-    assert run.faults == {("", TIME): 2}
-    times = [time_ns - EPOCH for topic, time_ns, _ in run.samples if topic == STATUS_TOPIC]
-    assert times == pytest.approx([k * S + 100 * MS + (3600 * S if k >= 5 else 0) for k in range(10)], abs=10 * MS)
