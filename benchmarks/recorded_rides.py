@@ -79,6 +79,7 @@ def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[
         if figures:
             title = f"{plan.name}, {planned.kind} · {vehicle.name}, payload {payload:g} kg"
             name = f"{log.parent.name}_{plan.name}_{form.replace(' ', '_')}.png"
+            figures.mkdir(parents=True, exist_ok=True)
             save(comparison(run, measured, title), figures / name)
     return found
 

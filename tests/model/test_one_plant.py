@@ -19,7 +19,7 @@ from gz_onboard.estimator.cells import Cell
 from gz_onboard.model.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.model.functions import Mesh, PiecewiseLinear
 from gz_onboard.model.model import air_density
-from gz_onboard.model.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, ocv_over, stepper
+from gz_onboard.model.series import bilinear_over, curve_over, extended_over, idle_loss, mesh_over, stepper
 from gz_onboard.recording.recording import read_recording
 from gz_onboard.simulation.parts import FirstOrderPack, Rider
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -296,9 +296,3 @@ def test_a_table_is_read_alike_one_value_or_many_at_a_time(data, xs, ys):
     curve = PiecewiseLinear(mesh.soc, table[0])
     assert extended_over(mesh.soc, table[0], x) == pytest.approx([curve.extended(a)[0] for a in x], rel=1e-9, abs=1e-9)
     assert np.interp(x, xs, table[0]) == pytest.approx([curve.at(a) for a in x], rel=1e-9, abs=1e-9)
-
-
-def test_a_battery_that_rests_lower_in_the_cold_does_so_for_a_whole_ride():
-    cold = replace(PACK, rest_shift_curve=PiecewiseLinear((-10.0, 25.0), (-0.03, 0.0)))
-    soc, celsius = np.array([0.1, 0.5, 1.02]), np.array([-20.0, 5.0, 30.0])
-    assert ocv_over(cold, soc, celsius) == pytest.approx([cold.ocv(s, t)[0] for s, t in zip(soc, celsius, strict=True)])

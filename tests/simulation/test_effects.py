@@ -146,19 +146,6 @@ def test_hysteresis_stays_at_rest_and_relaxation_does_not():
     assert states(scooter)["ocv_hysteresis"] > 0.004
 
 
-def test_more_resistance_and_less_cooling_heat_and_less_capacity_empties():
-    base, scooter = ride(BASE, 160.0)
-    grown, _ = ride(extended(cell_resistance_factor=2.0), 160.0)
-    assert grown.ledger["battery_heat"] > 1.7 * base.ledger["battery_heat"]
-    assert grown.series["pack_voltage"].min() < base.series["pack_voltage"].min()
-    faded, _ = ride(extended(cell_capacity=2.0), 160.0)
-    ratio = BASE.parameters["cell_capacity"] / 2.0
-    assert 0.8 - faded.soc_end == pytest.approx(ratio * (0.8 - base.soc_end), rel=0.02)
-    _, hot = ride(extended(cooling_factor=0.1), 160.0)
-    for part in ("motor_cooling", "inverter_cooling", "pack_cooling"):
-        assert getattr(hot, part).temperature > getattr(scooter, part).temperature
-
-
 def test_on_a_dynamometer_what_is_at_the_wheel_acts_and_air_and_bends_do_not():
     vehicle = extended(
         "dragging_brake", "drivetrain_drag", "cornering_drag", "headwind", "tyre_warm_up", wind_north=5.0

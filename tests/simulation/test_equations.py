@@ -250,15 +250,6 @@ def test_2_24_to_2_31_each_network_takes_its_own_heat():
     assert min(e[name] for name in ("motor_copper_loss", "inverter_loss", "battery_heat", "bms")) > 0.1
 
 
-def test_2_30_the_battery_cools_to_the_air():
-    scooter = Scooter(VEHICLE, soc=0.7, ambient=0.0, cell_temperature=30.0)
-    for _ in range(100):
-        scooter.step(0.0, 0.0)
-    heat = scooter.ledger["battery_heat"] + scooter.ledger["bms"]
-    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + heat
-    assert lost + reaction_heat(scooter, 30.0) == pytest.approx(P["pack_conductance"] * 30.0, rel=1e-4)
-
-
 @pytest.mark.parametrize("wind", [-15.0, 0.0, 4.0])
 def test_3_1_drag_keeps_its_sign_in_a_tailwind(wind):
     scooter = Scooter(VEHICLE, straight(0.0, wind), soc=0.7, speed=9.0)

@@ -12,7 +12,7 @@ from gz_onboard.pipeline import lacking
 from gz_onboard.recording.decode import feed
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-from tests.support import Run, S, Scooter, reference
+from tests.support import Run, Scooter, reference
 
 NEVER_HAD = r"rate_\w|accel_\w|gps_\w+|latitude|longitude|ambient_temperature"
 
@@ -60,16 +60,3 @@ def test_of_a_sensor_that_it_has_in_part_the_rest_is_watched(tmp_path):
     feed(run.pipeline, FrameColumns.of(silent))
     assert run.estimates[-1].reasons & Reason.NO_IMU
     assert run.estimates[-1].state is State.DEGRADED
-
-
-def test_a_pack_that_shows_nothing_is_still_invalid(tmp_path):
-    """Its voltage was never there, its current falls silent: nothing is published."""
-    vehicle = without(tmp_path, "pack_voltage|pack_current")
-    assert lacking(vehicle) == ["NO_PACK_VOLTAGE", "NO_PACK_CURRENT"]
-    run = Run(vehicle)
-    frames = Scooter().steady(30.0, current=20.0)
-    feed(run.pipeline, FrameColumns.of(frames))
-    before = len(run.estimates)
-    for seconds in (4, 5):
-        run.pipeline.advance([], frames[-1][0] + seconds * S)
-    assert [run.estimates[i].state for i in (before - 1, -1)] == [State.VALID, State.INVALID]  # first by the inverter's

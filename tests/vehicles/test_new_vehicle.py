@@ -127,21 +127,6 @@ def test_each_kind_is_checked_and_sends_range_frames(tmp_path, kind, capsys):
     assert cli.main(["run", "--vehicle", str(file), "--write-dbc", str(tmp_path / "range.dbc")]) == OK
 
 
-def test_an_estimate_and_a_check_on_a_log_of_it(tmp_path, capsys):
-    file, log = written(tmp_path, "nmc"), tmp_path / "ride.log"
-    database = read_vehicle(file).mapping.database
-    driven = (frame for frames in drive("nmc", database, Truth(0.6), 70.0) for frame in frames)
-    lines = (f"({1.7e9 + ns / 1e9:.6f}) can0 {key:03X}#{data.hex()}\n" for ns, key, data, _ in driven)
-    log.write_text("".join(lines), encoding="utf-8")
-    capsys.readouterr()
-    how = ["--no-plot", "--quiet", "--json", "-", "--output", str(tmp_path / "out")]
-    assert cli.main(["estimate", "--vehicle", str(file), *how, str(log)]) == OK
-    ride = json.loads(capsys.readouterr().out)["rides"][0]
-    assert 20 < ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
-    assert cli.main(["vehicle", "check", str(file), str(log), "--quiet"]) == OK
-    assert capsys.readouterr().out.splitlines()[0].endswith("looks right")
-
-
 def test_power_and_top_speed_are_what_is_entered(tmp_path):
     vehicle = read_vehicle(written(tmp_path, "nmc", "--power", "600", "--top-speed", "20"))
     most, p = vehicle.derating.current_by_motor_speed, vehicle.parameters
