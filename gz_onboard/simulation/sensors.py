@@ -44,26 +44,15 @@ def _column(name: str, factor: float = 1.0) -> Callable[[Truth], Array]:
     return lambda t: factor * t[name]
 
 
-def _temperatures() -> list[SimulatedSensor]:
-    places = {
-        "INV_Temperature": "inverter_temperature",
-        "INV_MotorTemperature": "motor_temperature",
-        "TC_Inverter1": "inverter_temperature",
-        "TC_Inverter2": "inverter_temperature",
-        "TC_Inverter3": "inverter_temperature",
-    }
-    places |= {f"BMS_CellTemp{which}": "cell_temperature" for which in ("Min", "Max", "Mean")} | {
-        "BMS_BoardTemp": "bms_temperature"
-    }
-    places |= {f"TC_Pack{i}": "cell_temperature" for i in range(1, 7)}
-    sensors = [SimulatedSensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
-    return sensors + [
-        SimulatedSensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")
-    ]
-
-
-def _delay(signal: str) -> float:
-    return BMS_DELAY if signal.startswith("BMS_") else 0.0
+# The thermometers that are not the ambient air's: the place, and how late [s].
+THERMOMETERS: dict[str, tuple[str, float]] = {
+    "INV_Temperature": ("inverter_temperature", 0.0),
+    "INV_MotorTemperature": ("motor_temperature", 0.0),
+    **{f"TC_Inverter{i}": ("inverter_temperature", 0.0) for i in range(1, 4)},
+    **{f"BMS_CellTemp{which}": ("cell_temperature", BMS_DELAY) for which in ("Min", "Max", "Mean")},
+    "BMS_BoardTemp": ("bms_temperature", BMS_DELAY),
+    **{f"TC_Pack{i}": ("cell_temperature", 0.0) for i in range(1, 7)},
+}
 
 
 def _inverter_voltage(t: Truth) -> Array:
@@ -180,7 +169,8 @@ SENSORS: tuple[SimulatedSensor, ...] = (
     SimulatedSensor("GPS_Altitude", lambda t: ALTITUDE + t["climb"], 1.5, GPS_DELAY, 30.0),
     SimulatedSensor("GPS_Satellites", lambda t: t.constant(9.0)),
     SimulatedSensor("GPS_Fix", lambda t: t.constant(3.0)),
-    *_temperatures(),
+    *(SimulatedSensor(signal, _column(place), delay=late) for signal, (place, late) in THERMOMETERS.items()),
+    *(SimulatedSensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")),
 )
 """Cell voltages, limits, steering and suspension are in the DBC files but not here: the simulation has none."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -13,6 +14,7 @@ from gz_onboard.vehicle import Vehicle
 CELLS = ("battery.cells_parallel", "battery.cells_series")
 _SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
 _STEPS = 5
+_NUMBER = r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)"
 _MOST_STEPS = 50
 
 
@@ -36,17 +38,12 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     Without STEPS five values; of cells every number, up to nine. InputError for an unknown name (with the nearest),
     a value out of the parameter's bounds (with its unit), and any other form.
     """
-    name, _, rest = text.partition("=")
-    span, _, steps = rest.partition(":")
-    first, dots, second = span.partition("..")
-    if not dots or (steps and not steps.isdecimal()):
-        raise InputError(f"--sweep {text}: must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5")
-    try:
-        ends = [float(first), float(second)]
-    except ValueError:
-        raise InputError(f"--sweep {text}: {first!r} and {second!r} must be numbers") from None
-    found = sweep_of(name.strip(), ends, vehicle, f"--sweep {text}")
-    low, high = ends
+    given = re.fullmatch(rf"([^=]+)={_NUMBER}\.\.{_NUMBER}(?::(\d+))?", text)
+    if given is None:
+        form = "must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5"
+        raise InputError(f"--sweep {text}: {form}")
+    name, low, high, steps = given[1].strip(), float(given[2]), float(given[3]), given[4]
+    found = sweep_of(name, (low, high), vehicle, f"--sweep {text}")
     if not low < high:
         raise InputError(f"--sweep {text}: {low:g} is not below {high:g}")
     of_cells = found.name in CELLS

@@ -153,7 +153,7 @@ def test_sweep_of_two(short, tmp_path, capsys):
         (["ece15", "--sweep", "drag_area=0.4..9"], ["9 m²", "0.05 to 8 m²"]),
         (["ece15", "--sweep", "drag_area=0.6..0.4"], ["0.6", "below"]),
         (["ece15", "--sweep", "drag_area"], ["NAME=LOW..HIGH"]),
-        (["ece15", "--sweep", "drag_area=a..b"], ["'a' and 'b' must be numbers"]),
+        (["ece15", "--sweep", "drag_area=a..b"], ["must be NAME=LOW..HIGH"]),
         (["ece15", "--sweep", "battery.cells_parallel=1.5..4"], ["whole number"]),
         (["ece15", "--sweep", "drag_area=0.4..0.6:999"], ["999 steps"]),
         (["ece15", *(["--sweep", "drag_area=0.4..0.6"] * 2)], ["twice"]),
