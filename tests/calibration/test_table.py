@@ -112,14 +112,6 @@ def test_what_is_wrong_is_named(tmp_path, text, needed, message):
     assert "x.csv" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "text", ["time_s\tnote\tvoltage_V\n0\ta,b\t4.1\n1\t\t4\n", "time_s;note;voltage_V\n0;a,b;4,1\n1;;4\n"]
-)
-def test_tabs_and_semicolons_separate_too(tmp_path, text):
-    table = read_table(write(tmp_path, text))
-    assert table["time"].tolist() == [0, 1] and table["voltage"].tolist() == [4.1, 4.0]
-
-
 def test_two_columns_of_one_name_may_be_there_if_none_asks_for_them(tmp_path):
     file = write(tmp_path, "time_s,Loop,Loop,voltage_V\n0,1,2,4.1\n")
     assert read_table(file)["voltage"].tolist() == [4.1]
