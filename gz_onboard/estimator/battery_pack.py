@@ -9,10 +9,10 @@ voltage, or on the state of charge that a rest shows. After a long gap, and wher
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import exp, inf, sqrt
-from typing import Any, Protocol
+from typing import Any
 
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator import pack_age, weakest
@@ -85,16 +85,6 @@ FIELDS = {  # of the saved state
     "cell_effects": Each(Number(-LARGEST, LARGEST), 100),  # V of a cell
     "learned": {**pack_age.FIELDS, "weakest": weakest.FIELDS},
 }
-
-
-class RidingLoad(Protocol):
-    """Quantities of the riding that the state of charge depends on; times in s."""
-
-    def power_of_prior(self, now: float) -> float:
-        """Power of the prior riding [W]."""
-
-    def cell_inputs(self, now: float) -> dict[str, float]:
-        """Inputs of effects in the cells, apart from those of the cells themselves."""
 
 
 class Synchroniser:
@@ -271,12 +261,14 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        load: RidingLoad,
+        inputs: Mapping[str, float],
+        prior_power: Callable[[float], float],
         price: float | None,
     ) -> None:
         """Advance by `dt` [s] to `now` [s].
 
-        temperature: of the cells [degC]; speed in m/s; price: the consumption expected [J/m].
+        temperature: of the cells [degC]; speed in m/s; inputs: of effects in the cells, apart from those of the cells
+        themselves; prior_power: of the prior riding [W] at a time [s]; price: the consumption expected [J/m].
         """
         self._follow_gap(now, dt, reading, temperature, price)
         voltage, current = reading.voltage, reading.current
@@ -288,7 +280,7 @@ class BatteryPack:
                 self.test.off += 1
         if self.is_started:
             if dt > 0:
-                self._predict(now, dt, reading, temperature, load)
+                self._predict(now, dt, reading, temperature, inputs)
             self._follow_vehicle(now, dt, current, speed)
             self._measure(now, dt, reading, temperature)
             if self.weakest.mapped:
@@ -296,7 +288,7 @@ class BatteryPack:
                 self.weakest.step(now, reading, temperature, self.battery, self.soc, overpotential)
         else:
             if voltage is not None:
-                self._await_first(now, voltage, reading, temperature, speed, load)
+                self._await_first(now, voltage, reading, temperature, speed, prior_power)
             self.vehicle = self.vehicle._replace(current=current)
         self._follow_age()
 
@@ -336,7 +328,9 @@ class BatteryPack:
             way += abs(speed or 0.0) * dt
         self.vehicle = Past(current, way, own_soc.value if own_soc.fresh(now) else own)
 
-    def _predict(self, now: float, dt: float, reading: PackReading, temperature: float, load: RidingLoad) -> None:
+    def _predict(
+        self, now: float, dt: float, reading: PackReading, temperature: float, inputs: Mapping[str, float]
+    ) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, state, signals = self.battery, self.state, self._signals
         mean = reading.current or 0.0  # over the window
@@ -366,7 +360,6 @@ class BatteryPack:
         v1 = state.v1
         self._advance(dt, mean, variance, temperature)
         self._v1_lag = (v1 - self.state.v1) / 2 if dt <= 2 * WINDOW else 0.0
-        inputs = load.cell_inputs(now)
         self.effects.step(battery, dt, mean / battery.cells_parallel, self.state.soc, temperature, inputs)
 
     def _advance(self, dt: float, current: float, variance: float, temperature: float) -> None:
@@ -536,7 +529,7 @@ class BatteryPack:
         reading: PackReading,
         temperature: float,
         speed: float | None,
-        load: RidingLoad,
+        prior_power: Callable[[float], float],
     ) -> None:
         """Start from the first pack `voltage` [V] that holds still, once all that comes once a second is known.
 
@@ -565,12 +558,11 @@ class BatteryPack:
             return
         self._waiting_since, self._was_unsteady = inf, False
         unsteady_sd = self._span if is_late else PACK.steady_sd * moved
-        self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, load)
+        self._start(now, first._replace(unsteady_sd=unsteady_sd), reading, temperature, prior_power(now))
 
-    def _start(self, now: float, first: First, reading: PackReading, temperature: float, load: RidingLoad) -> None:
-        """Start from the `first` voltage and the state that was believed."""
+    def _start(self, now: float, first: First, reading: PackReading, temperature: float, power: float) -> None:
+        """Start from the `first` voltage and the state that was believed; power: of the prior riding [W]."""
         battery, effects, past = self.battery, self.effects, self.past
-        power = load.power_of_prior(now)
         self._joined = bool(first.moving) and not past
         if self._unseen:
             drawn = first.current

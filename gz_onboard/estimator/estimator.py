@@ -119,7 +119,8 @@ class Estimator:
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed, gap=elapsed < dt)
         temperature = self._temperatures.step(now, dt, self.pack.heat if dt <= signals.pause else None)
-        self.pack.step(now, dt, self._reading, temperature, motion.speed, self.load, self.forecaster.consumption)
+        inputs, price = self.load.cell_inputs(now), self.forecaster.consumption
+        self.pack.step(now, dt, self._reading, temperature, motion.speed, inputs, self.load.power_of_prior, price)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         if not self.pack.is_started:

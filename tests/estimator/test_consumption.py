@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from math import sqrt
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.consumption import Habits, LearnedQuantity
+from gz_onboard.estimator.consumption import CONSUMPTION, Habits, LearnedQuantity, Terrain
 from gz_onboard.estimator.forecast import Forecaster, RangeSmoother
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.model.riding import PriorRiding
@@ -108,3 +109,32 @@ def test_a_segment_that_no_riding_explains_counts_for_little():
     """A ferry queue that costs a hundred times the price moves it by a tenth."""
     quantity = quantity_of(0.05, 0.055, 0.2)
     assert 0.07 < quantity.learned(100.0, 250.0).now - 1 < 0.15
+
+
+# --- terrain ------------------------------------------------------------------------------------------------------
+
+RATE, STRETCH, SEGMENT = CONSUMPTION.terrain_rate, CONSUMPTION.stretch_m, CONSUMPTION.segment_m
+
+
+def climbed(climbs: list[float]) -> Terrain:
+    """After stretches that climb by so many metres each."""
+    terrain = Terrain()
+    for climb in climbs:
+        for _ in range(int(STRETCH / SEGMENT)):
+            terrain = terrain.ridden(SEGMENT, climb * SEGMENT / STRETCH, 0.0)
+    return terrain
+
+
+def test_level_roads_are_learned_as_such():
+    assert climbed([1.0, -1.0] * 10).rate < RATE / 5
+
+
+def test_mountains_are_learned_within_some_stretches():
+    found = climbed([150.0, -100.0, 120.0])
+    assert found.rate == pytest.approx((150**2 + 100**2 + 120**2) / 3 / STRETCH, rel=0.5)
+    assert found.rate > 30 * RATE
+
+
+def test_on_a_short_way_a_slope_goes_on():
+    assert sqrt(Terrain().variance(200.0)) == pytest.approx(2 * sqrt(Terrain().variance(100.0)))
+    assert Terrain().variance(2 * STRETCH) == pytest.approx(2 * Terrain().variance(STRETCH))

@@ -407,3 +407,23 @@ def test_joined_mid_ride_it_says_so_until_a_rest_shows_the_state_of_charge():
     follow(e, scooter.live(3600), scooter)
     rows = follow(e, scooter.live(20, 11.0), scooter)
     assert rows[-1][1].activity is Activity.RIDING
+
+
+def test_what_was_learned_from_a_doubled_speed_is_unlearned():
+    scooter, e = Scooter(soc=0.9), estimator()
+    follow(e, scooter.live(60), scooter)
+    before = e.forecaster.learner.factor
+    doubled = ((t, g, (2 * (v[0] or 0.0),) if g == MOTOR else v) for t, g, v in scooter.live(400, 10.0))
+    _, end = follow(e, doubled, scooter)[-1]
+    assert "motor_speed" in end.distrusted
+    assert end.speed is None
+    assert e.forecaster.learner.factor == before
+
+
+def test_a_speed_of_zero_with_the_current_of_a_drive_is_no_standing():
+    scooter, e = Scooter(soc=0.9), estimator()
+    follow(e, scooter.live(300, 10.0), scooter)
+    dead = ((t, g, (0.0,) if g == MOTOR else v) for t, g, v in scooter.live(60, 10.0))
+    rows = follow(e, dead, scooter)
+    assert all(row.activity is Activity.UNKNOWN for _, row in rows[15:40])
+    assert not e._activity.teaches
