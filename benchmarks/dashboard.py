@@ -22,9 +22,9 @@ from typing import Any
 from urllib.request import urlopen
 
 from gz_onboard import cli
-from gz_onboard.can._can import can
 from gz_onboard.can.layout import crc8_sae_j1850
 from gz_onboard.can.publisher import Counts, Publisher
+from gz_onboard.can.python_can import can
 from gz_onboard.events import Activity, Estimate, Frame, State
 
 FIRST = 3.0  # s: start-up, which is not measured

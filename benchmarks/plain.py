@@ -26,8 +26,8 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from mcap.writer import Writer
 
-from gz_onboard.can._can import can
 from gz_onboard.can.layout import crc8_sae_j1850
+from gz_onboard.can.python_can import can
 from gz_onboard.vehicle import read_vehicle
 
 DBC = Path(__file__).resolve().parents[1] / "dbc"

@@ -31,7 +31,7 @@ class StandIn(socket.socket):
 def install(receive_port: int, send_port: int, library: bool) -> None:
     """From now on a SocketCAN bus receives on one port of 127.0.0.1 and sends to the other; library: python-can's."""
     if library:
-        importlib.import_module("gz_onboard.can._can")  # python-can without its large imports
+        importlib.import_module("gz_onboard.can.python_can")  # python-can without its large imports
         module = importlib.import_module("can.interfaces.socketcan.socketcan")
     else:
         module = importlib.import_module("gz_onboard.can.channel")

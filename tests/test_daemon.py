@@ -20,8 +20,8 @@ import can
 import pytest
 
 from gz_onboard import state
-from gz_onboard.can._can import LibraryBus
 from gz_onboard.can.channel import CanChannel
+from gz_onboard.can.python_can import LibraryBus
 from gz_onboard.can.recorder import LogLimits, Recorder
 from gz_onboard.daemon.command import _lock
 from gz_onboard.daemon.loop import Daemon

@@ -1,8 +1,8 @@
 """A CAN channel, drained once for each tick of its reader instead of waking up for each frame.
 
-A SocketCAN bus is read by its socket, all others by python-can (`gz_onboard.can._can`), which is imported for them
-only: it costs 9 MB and a fifth of the daemon's start. A bus that goes down is closed, and reopened once it is back;
-nothing here raises for it.
+A SocketCAN bus is read by its socket, all others by python-can (`gz_onboard.can.python_can`), which is imported for
+them only: it costs 9 MB and a fifth of the daemon's start. A bus that goes down is closed, and reopened once it is
+back; nothing here raises for it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
 
 if TYPE_CHECKING:
-    from gz_onboard.can._can import LibraryBus
+    from gz_onboard.can.python_can import LibraryBus
 
 SOCKETCAN = "socketcan"
 MAX_FRAMES, READ_S = 5000, 0.08
@@ -191,7 +191,7 @@ class CanChannel:
         if self.interface == SOCKETCAN:
             self._bus = SocketCanBus(self.name, self._identifiers)
         else:
-            from gz_onboard.can._can import LibraryBus  # only here: a slow import
+            from gz_onboard.can.python_can import LibraryBus  # only here: a slow import
 
             self._bus = LibraryBus(self.interface, self.name, self._identifiers)
 

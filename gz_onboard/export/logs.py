@@ -63,7 +63,7 @@ def whole(out: Path, suffix: str) -> Iterator[Path]:
 
 def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
     """Write the frames to `out` by python-can, in the format of `suffix`; returns their number."""
-    from gz_onboard.can._can import can
+    from gz_onboard.can.python_can import can
     from gz_onboard.recording.readers.python_can import message_of, with_asammdf
 
     if suffix == ".mf4":

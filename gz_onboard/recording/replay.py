@@ -99,7 +99,7 @@ def bus_sender(*buses: can.BusABC) -> Send:
 
     Waits for room in a full queue; a bus that is down loses frames, as a bus does.
     """
-    from gz_onboard.can._can import can
+    from gz_onboard.can.python_can import can
     from gz_onboard.recording.readers.python_can import message_of
 
     def send(frame: Frame) -> bool:
@@ -198,8 +198,8 @@ def log_section(log: Path, frames: FrameColumns, start_s: float, end_s: float | 
 
 
 def _open_bus(interface: str, name: str) -> can.BusABC:
-    from gz_onboard.can._can import can, check_interface, open_bus
     from gz_onboard.can.channel import NO_SOCKETS
+    from gz_onboard.can.python_can import can, check_interface, open_bus
 
     check_interface(interface)
     options = {"fd": True} if interface == "socketcan" else {}

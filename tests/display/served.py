@@ -13,11 +13,11 @@ from types import ModuleType
 import pytest
 
 from gz_onboard import cli
-from gz_onboard.can._can import can
 from gz_onboard.can.channel import CanChannel
 from gz_onboard.can.dbc import find_dbc, load_database
 from gz_onboard.can.layout import crc8_sae_j1850
 from gz_onboard.can.publisher import Counts, Publisher
+from gz_onboard.can.python_can import can
 from gz_onboard.display import command
 from gz_onboard.display.command import pictures
 from gz_onboard.display.server import Feed, served

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 from websockets.sync.client import connect
 
-from gz_onboard.can._can import can
+from gz_onboard.can.python_can import can
 from gz_onboard.display import foxglove as command
 from gz_onboard.display.vehicle_frames import VehicleFrames
 from gz_onboard.events import Frame

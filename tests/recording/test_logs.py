@@ -317,7 +317,7 @@ def test_an_mcap_of_other_things_is_refused(tmp_path: Path) -> None:
 def test_mf4_is_read_where_asammdf_is_installed_and_else_says_so(tmp_path: Path) -> None:
     code = """
 import sys
-from gz_onboard.can._can import can
+from gz_onboard.can.python_can import can
 heavy = [name for name in ("pandas", "asammdf", "numpy") if name in sys.modules]
 assert not heavy, heavy
 from gz_onboard.recording.logs import read_frames

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any, cast
 
-from gz_onboard.can._can import can, flagged
+from gz_onboard.can.python_can import can, flagged
 from gz_onboard.errors import InputError, shown
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.frames import FrameColumns

@@ -1,4 +1,4 @@
-"""A bus of any of python-can's interfaces, and python-can itself: ``from gz_onboard.can._can import can``.
+"""A bus of any of python-can's interfaces, and python-can itself: ``from gz_onboard.can.python_can import can``.
 
 Where asammdf is installed, ``import can`` loads it for its MF4 reader, and with it pandas: 86 MB and 0.9 s that
 a daemon which never reads an MF4 file would pay at each start.
