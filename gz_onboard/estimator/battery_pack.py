@@ -130,7 +130,7 @@ class InnovationTest:
     def blame_model(self, variance: float) -> None:
         """Believe the cell model no better than the last error shows; variance: known of it [V²].
 
-        The state of charge is made uncertain by that same error, and explains none of it.
+        The state of charge is made uncertain by that same error, and explains no part of it.
         """
         self.misfit = (self.innovation or 0.0) ** 2 / variance
         self.contradicted, self._model_is_blamed = 0.0, True
@@ -601,7 +601,7 @@ class BatteryPack:
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """The state, the vehicle and what was learned, to be kept over a restart."""
+        """The state, the vehicle and the learned factors, to be kept over a restart."""
         state = self.state
         return {
             "soc": min(max(state.soc, 0.0), 1.0),

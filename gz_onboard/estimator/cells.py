@@ -73,7 +73,7 @@ class CellEffects:
     def supposed(self, sensor: str, now: float, current: float) -> float:
         """`mean_overpotential` [V] at `now` [s] if the cell's `current` [A] by `sensor` flows.
 
-        Each sensor has a memory of its own, from when it is first asked for: the effects of a current that has just
+        Each sensor has its memory, from when it is first asked for: the effects of a current that has just
         changed have not built up yet, those of an old one have settled.
         """
         then, states = self._supposed.get(sensor, (now, self.states))

@@ -1,8 +1,8 @@
-"""Windows in, estimates out: the order of one step, and what of it is reported and saved.
+"""Windows in, estimates out: the order of one step, the values reported and those saved.
 
 No I/O and no clock: time arrives with the windows, so the same windows give the same estimates, to the last bit.
-All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
-check the sensors and choose the pack's voltage and current (`plausibility`), follow the motion (`motion`), choose the
+All state lives here and in the parts owned here; `snapshot` and `restore` carry it over a restart. One step: check the
+sensors and choose the pack's voltage and current (`plausibility`), follow the motion (`motion`), choose the
 temperatures, step the battery filter (`battery_pack`), learn from the riding and forecast (`forecaster`).
 """
 

@@ -59,7 +59,7 @@ MOTION = MotionConfig()
 class Motion:
     """State and result of the motion filter. None: not known, for want of sensors.
 
-    wheel_radius: of the driven wheel [m]; gear_ratio: wheel speed over what the motor's sensor shows.
+    wheel_radius: of the driven wheel [m]; gear_ratio: wheel speed over the reading of the motor's sensor.
     """
 
     def __init__(self, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:

@@ -1,4 +1,4 @@
-"""Age of a pack: what is believed of its capacity and resistance, and when the battery filter may learn them.
+"""Age of a pack: the belief of its capacity and resistance, and when the battery filter may learn them.
 
 The filter's inverse capacity and resistance are normal; packs are not. A share of them (`Battery.as_new`, half if the
 file does not say) is as new, the others have lost up to half of their capacity, those with more resistance more of it

@@ -152,7 +152,7 @@ class WeakestGroup:
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was learned: the pack has been replaced."""
+        """Start again from the prior: the pack has been replaced."""
         sds = enumerate(self._prior_sd)
         rows = tuple(tuple(sd * sd if i == j else 0.0 for j in range(len(self._prior_sd))) for i, sd in sds)
         self.known = self._undoubted = GroupBelief((0.0,) * len(rows), rows)

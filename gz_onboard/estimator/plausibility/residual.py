@@ -1,4 +1,4 @@
-"""The mechanism of all sensor checks, their configuration, and the checks of single sensors against what can be.
+"""The mechanism of all sensor checks, their configuration, and the checks of single sensors against physical limits.
 
 A residual is a measured value minus its prediction from other sensors, from a model or from its own past. It is divided
 by the standard deviation that a healthy pair of sensors may show, so that 1 is the limit for all quantities alike
@@ -6,7 +6,7 @@ by the standard deviation that a healthy pair of sensors may show, so that 1 is 
 a number of steps.
 
 Slow signals, as temperatures and altitude, are predicted by their own past: they cannot change faster than heat flows
-or a road climbs. Inertial axes are held against what a vehicle can have.
+or a road climbs. Inertial axes are held against the limits of a vehicle.
 """
 
 from __future__ import annotations
