@@ -65,6 +65,7 @@ class CurveConfig:
     own_rounds: int = 10  # of expectation and maximisation
     own_free: float = 100.0  # variance of the common curve while its scatter between rides is sought
     least_spread: float = 0.05  # sd of a quantity over the distance of two knots
+    learned: float = 1e-12  # variance in scales of a parameter that a curve does not move
     visited: float = 1.0  # sum of squared weights of a ride's blocks at a knot
 
 
@@ -167,7 +168,7 @@ class CurveFit:
     """A curve that rides show. chi2: twice the rise of the log likelihood, with `k` degrees of freedom.
 
     healthy_chi2: over the inflation of healthy rides; score: the same as of one degree of freedom. values (knots,): at
-    the knots [the channel's unit]; covariance (knots, knots); weights (knots,): share of the rides at each.
+    the knots [the channel's unit]; covariance (knots, knots).
     """
 
     form: CurveForm
@@ -177,36 +178,30 @@ class CurveFit:
     k: int
     values: Array
     covariance: Array
-    weights: Array
-
-    def contrasts(self) -> tuple[Array, Array]:
-        """(values minus their mean, standard deviations of these), each (knots,): what no constant could be."""
-        d = np.eye(len(self.values)) - self.weights
-        return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
-def supported_knots(form: CurveForm, lines: Sequence[LinearRide]) -> tuple[Array, Array]:
-    """(coefficients that the rides determine, (k, free); share of the rides at each knot).
+def supported_knots(form: CurveForm, lines: Sequence[LinearRide]) -> Array:
+    """Coefficients that the rides determine, (k, free).
 
     A knot that fewer than two rides visit moves with its nearest visited neighbour, so that no curve bends where
     nothing was measured. No coefficient is free where the quantity hardly varies: the curve would be a constant.
     """
+    none = np.zeros((form.basis.shape[1], 0))
     found = [knots for line in lines if (knots := columns_of(line, form)) is not None]
-    visits = np.array([(knots**2).sum(axis=0) for knots in found]).reshape(-1, len(form.knots))
-    weights = visits.sum(axis=0) / max(float(np.sum(visits)), 1e-12)
-    none = np.zeros((form.basis.shape[1], 0)), weights
     if not found:
         return none
+    is_constant = form.quantity == CONSTANT
     spread = float(np.concatenate(found).var(axis=0).sum())
-    if form.quantity != CONSTANT and spread <= 2 * FITTING.least_spread**2:
+    if not is_constant and spread <= 2 * FITTING.least_spread**2:
         return none
     if form.straight:
-        return np.eye(1), weights
-    good = np.flatnonzero((visits >= FITTING.visited).sum(axis=0) >= min(2, len(lines)))
-    if len(good) < (1 if form.quantity == CONSTANT else 2):
+        return np.eye(1)
+    visits = np.array([(knots**2).sum(axis=0) >= FITTING.visited for knots in found])
+    good = np.flatnonzero(visits.sum(axis=0) >= min(2, len(lines)))
+    if len(good) < (1 if is_constant else 2):
         return none
     nearest = np.abs(np.arange(len(form.knots))[:, None] - good).argmin(axis=1)
-    return np.asarray(np.eye(len(good))[nearest]), weights
+    return np.asarray(np.eye(len(good))[nearest])
 
 
 def fit_curve(
@@ -216,7 +211,7 @@ def fit_curve(
 
     own: with the scatter of its coefficients that these rides show, if it is more than usual.
     """
-    free, weights = supported_knots(form, lines)
+    free = supported_knots(form, lines)
     if not free.shape[1]:
         return None
     rides = [ride for line in lines if (ride := extended(mixed, line, form)) is not None]
@@ -230,34 +225,25 @@ def fit_curve(
         known = replace(known, scatter=np.maximum(known.scatter, shown))
     shown_by = known.evidence(rides).profiled(range(p, p + k), fixed)
     inner = free.T @ (shown_by.information + FITTING.ridge * np.eye(k)) @ free
-    score = free.T @ shown_by.score
-    estimate, at = np.linalg.solve(inner, score), form.basis @ free * form.size
-    chi2, count = float(score @ estimate), free.shape[1]
+    gradient = free.T @ shown_by.score
+    estimate, at = np.linalg.solve(inner, gradient), form.basis @ free * form.size
+    chi2, count = float(gradient @ estimate), free.shape[1]
     healthy_chi2 = chi2 / (healthy.inflation if healthy else 1.0)
-    sure = one_degree(healthy_chi2, count, mixed.freedom)
+    score = one_degree(healthy_chi2, count, mixed.freedom)
     covariance = at @ np.linalg.inv(inner) @ at.T
-    return CurveFit(form, chi2, healthy_chi2, sure, count, at @ estimate, covariance, weights)
+    return CurveFit(form, chi2, healthy_chi2, score, count, at @ estimate, covariance)
 
 
 def healthy_curves(mixed: MixedModel, lines: Sequence[LinearRide]) -> dict[str, HealthyCurve]:
     """The curves that healthy rides leave with the parameters of `mixed` as they were learned."""
-    found = {}
+    found, p = {}, len(mixed.mean)
+    learned = Population(mixed.mean, FITTING.learned * np.eye(p), mixed.scatter)
     for form in curve_forms(mixed.system.sizes):
         rides = [ride for line in lines if (ride := extended(mixed, line, form)) is not None]
-        if not rides:
-            continue
-        p = len(mixed.mean)
-        k = len(rides[0].score) - p
-        m, c = np.zeros((k, k)), np.zeros(k)
-        for ride in rides:
-            n, b = ride.information, ride.score
-            v = np.linalg.inv(np.diag(1 / mixed.scatter) + n[:p, :p])
-            u = mixed.mean + v @ (b[:p] - n[:p, :p] @ mixed.mean)
-            inner = n[p:, p:] - n[p:, :p] @ v @ n[:p, p:]
-            part = Statistics((inner + inner.T) / 2, b[p:] - n[p:, :p] @ u).marginal(np.full(k, form.scatter**2))
-            m, c = m + part.information, c + part.score
-        covariance = np.linalg.inv(m + np.eye(k))
-        found[form.name] = HealthyCurve(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
+        if rides:
+            k = len(rides[0].score) - p
+            post = learned.bordered(np.zeros(k), np.eye(k), np.full(k, form.scatter**2)).fit(rides)
+            found[form.name] = HealthyCurve(post.mean[p:], post.covariance[p:, p:], 1.0)
     return found
 
 

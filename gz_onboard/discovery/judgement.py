@@ -71,16 +71,9 @@ class JudgementConfig:
     least_alternative: float = 0.4  # of the threshold, that a replacement must explain by itself
     margin: float = 6.0  # of chi-squared: a likelihood ratio of 20
     look_alike: float = 0.8  # cosine of two candidates
-    left: float = 0.1  # of the evidence for the causes: a further curve with less is the bend of a large effect
-    unlike_left: float = 0.004  # the same where the curve contradicts them
+    bend: float = 0.1  # of the evidence for the causes: a further curve with less corrects the form of a large effect
     curve: float = 1.5  # evidence for a curve over that for a cause: its knots were chosen by eye
-    unlike: float = 0.5  # of a cause's effect in a channel: a curve that takes more is not its bend
-    rival: float = 0.25  # of the evidence for the causes of its channel, likewise
-    clear: float = 4.0  # standard deviations of a value of a curve
     own_share: float = 0.3  # of the evidence for a cause: a channel with more names it
-    weighty: float = 0.02  # of the rides at a knot that can contradict
-    acting: float = 0.1  # of the most that causes do: where they do less they do not act
-    better: float = 15.0  # of chi-squared, less 2 for each further knot, by which a curve beats a cause
     far_beyond: float = 10.0  # times the threshold: the score of an impossible candidate that is no chance
     most_refitted: float = 0.25  # of the energy: healthy rides refit a tenth against the file alone
     least_refitted: float = 0.02  # of the energy, for one parameter to be named
@@ -390,56 +383,69 @@ def errors(line: LinearRide, theta: Array) -> dict[str, float]:
 
 
 def unexplained(now: Search, constancy: Sequence[Split]) -> Unknown | None:
-    """The curve that explains most with the causes chosen, and which of them it refutes; None without one.
+    """The curve that explains most next to the causes chosen, or in place of one of them; None without one.
 
-    A curve refutes causes if it takes back, or adds, half or more of their effect somewhere in a channel that names
-    them, if it has a quarter of their evidence, if it explains much more than one of them in its place, or if
-    `constancy` finds one unequal. Other causes must then be significant without the refuted ones.
+    A cause that `constancy` finds unequal is refuted as well. Other causes must then be significant without the refuted
+    ones.
     """
     best = best_curve(now)
-    if best is None or not best.denies:
-        best = rival_curve(now) or best
     uneven = [split for split in constancy if split.unequal and not split.of_ride]
     if uneven and (best is None or not best.denies):
-        best = curve_over_split(now, max(uneven, key=lambda split: split.chi2)) or best
+        worst = max(uneven, key=lambda split: split.chi2)
+        forms = [f for f in curve_forms(now.mixed.system.sizes) if f.quantity == worst.quantity and not f.straight]
+        curves = [curve for form in forms if (curve := curve_with(now, form, [])) is not None]
+        if curves:
+            best = described(now, max(curves, key=lambda curve: curve.score), [worst.cause])
     if best is None or not best.denies:
         return best
     denied = dict.fromkeys([*best.denies, *(split.cause for split in uneven)])
-    left = [name for name in now.chosen if name not in denied]
-    least = max(now.limit, JUDGE.left * best.chi2)
-    denied |= dict.fromkeys(name for name in left if now.part(left, name) < least)
+    rest = [name for name in now.chosen if name not in denied]
+    threshold = max(now.limit, JUDGE.bend * best.chi2)
+    denied |= dict.fromkeys(name for name in rest if now.contribution(rest, name) < threshold)
     return replace(best, denies=tuple(denied))
 
 
-def curves_with(now: Search, chosen: Sequence[str], forms: Sequence[CurveForm]) -> list[CurveFit]:
-    """Those of `forms` that the rides show, fitted with the causes `chosen`."""
-    found = (fit_curve(now.mixed, now.lines, form, now.index(chosen)) for form in forms)
-    return [curve for curve in found if curve is not None]
+def best_curve(now: Search) -> Unknown | None:
+    """The curve that explains most next to the causes chosen; one that refutes causes goes first.
+
+    With more than twice the error of an effect's form, a curve is no correction of it, and refutes the causes that have
+    their evidence in its channel.
+    """
+    total, best, most = now.evidence.gain(now.index(now.chosen)), None, (False, 0.0)
+    for form in curve_forms(now.mixed.system.sizes):
+        curve = curve_with(now, form, now.chosen)
+        if curve is None or not is_significant(now, curve):
+            continue
+        refuted = [name for name in now.chosen if now.shares[name].get(form.channel, 0.0) > JUDGE.own_share]
+        if refuted and relative_size(now, curve) < 2 * form_error({form.channel: 1.0}):
+            refuted = []
+        rank = bool(refuted), curve.score
+        if rank <= most or (not refuted and curve.chi2 < JUDGE.bend * total):
+            continue
+        if is_accepted(now, form, [name for name in now.chosen if name not in refuted]):
+            best, most = described(now, curve, refuted), rank
+    return best
+
+
+def relative_size(now: Search, curve: CurveFit) -> float:
+    """The rms of a curve over that of the effect of the causes chosen in its channel."""
+    change, squares = now.change, np.zeros(2)
+    for line in now.lines:
+        knots = columns_of(line, curve.form)
+        if knots is not None:
+            table = line.tables[curve.form.channel]
+            squares += np.sum((knots @ curve.values / table.unit) ** 2), np.sum((table.a @ change) ** 2)
+    return float(np.sqrt(squares[0] / max(squares[1], 1e-12)))
+
+
+def curve_with(now: Search, form: CurveForm, chosen: Sequence[str]) -> CurveFit | None:
+    """The curve of `form` fitted with the causes `chosen`; None if the rides do not show it."""
+    return fit_curve(now.mixed, now.lines, form, now.index(chosen))
 
 
 def is_significant(now: Search, curve: CurveFit) -> bool:
     """Whether a curve has the score that it must have; a straight line counts as a try instead."""
     return curve.score >= now.limit * (1.0 if curve.form.straight else JUDGE.curve)
-
-
-def best_curve(now: Search) -> Unknown | None:
-    """The curve that explains most with the causes chosen, refuting those of its channel if it is no bend of theirs."""
-    total, best = now.evidence.gain(now.index(now.chosen)), None
-    for curve in curves_with(now, now.chosen, curve_forms(now.mixed.system.sizes)):
-        if not is_significant(now, curve):
-            continue
-        channel = curve.form.channel
-        mine = [name for name in now.chosen if now.shares[name].get(channel, 0.0) > JUDGE.own_share]
-        theirs = sum(now.part(now.chosen, name) for name in mine)
-        unlike = contradicts_causes(now, curve) or bool(mine and curve.healthy_chi2 > JUDGE.rival * theirs)
-        if now.chosen and curve.chi2 < (JUDGE.unlike_left if unlike else JUDGE.left) * total:
-            continue
-        denied = mine if unlike else []
-        if best is not None and (unlike, curve.score) <= (bool(best.denies), best.score):
-            continue
-        if is_accepted(now, curve.form, [name for name in now.chosen if name not in denied]):
-            best = described(now, curve, denied)
-    return best
 
 
 def is_accepted(now: Search, form: CurveForm, rest: Sequence[str]) -> bool:
@@ -450,28 +456,6 @@ def is_accepted(now: Search, form: CurveForm, rest: Sequence[str]) -> bool:
         return False
     causes = [now.causes[name] for name in rest]
     return len(now.lines) < 2 or improves(held_out(now.mixed, now.lines, causes, causes, form), {form.channel: 1.0})
-
-
-def rival_curve(now: Search) -> Unknown | None:
-    """The curve that explains much better than one of the causes chosen, in its own channel."""
-    best, most = None, JUDGE.better
-    for name in now.chosen:
-        rest = [other for other in now.chosen if other != name]
-        own = now.step(rest, name)
-        forms = curve_forms(now.mixed.system.sizes)
-        mine = [form for form in forms if now.shares[name].get(form.channel, 0.0) >= JUDGE.own_share]
-        for curve in curves_with(now, rest, mine):
-            ahead = curve.healthy_chi2 - 2 * (curve.k - 1) - own * max(now.mixed.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, JUDGE.unlike_left * own) and is_accepted(now, curve.form, rest):
-                best, most = described(now, curve, [name]), ahead
-    return best
-
-
-def curve_over_split(now: Search, split: Split) -> Unknown | None:
-    """The curve over the quantity of `split`, with no cause named, in the channel where it explains most."""
-    forms = [f for f in curve_forms(now.mixed.system.sizes) if f.quantity == split.quantity and not f.straight]
-    found = max(curves_with(now, [], forms), key=lambda curve: curve.score, default=None)
-    return None if found is None else described(now, found, [split.cause])
 
 
 def described(now: Search, curve: CurveFit, denies: Sequence[str]) -> Unknown:
@@ -488,35 +472,6 @@ def described(now: Search, curve: CurveFit, denies: Sequence[str]) -> Unknown:
     share, unit = more / drawn if drawn else 0.0, KNOTS[form.quantity][1]
     shape = (form.channel, form.quantity, form.straight, unit)
     return Unknown(*shape, curve.score, curve.chi2, rows, tuple(denies), share)
-
-
-def contradicts_causes(now: Search, curve: CurveFit) -> bool:
-    """Whether a curve is more than the bend of the causes' effect in a channel that names them."""
-    size, share = channel_effect(now, curve.form.channel)
-    if share <= JUDGE.own_share or size <= 0:
-        return False
-    value, sd = curve.contrasts()
-    certain = np.abs(value) > JUDGE.clear * sd * (curve.chi2 / curve.healthy_chi2) ** 0.5
-    return bool(np.any(np.abs(value)[certain & (curve.weights > JUDGE.weighty)] > JUDGE.unlike * size))
-
-
-def channel_effect(now: Search, channel: str) -> tuple[float, float]:
-    """(effect of the causes chosen in `channel`, rms where they act [unit]; the channel's share of the evidence)."""
-    change = now.change
-    parts, here, everywhere = [np.zeros(1)], 0.0, 0.0
-    for line in now.lines:
-        for name, table in line.tables.items():
-            effect = table.a @ change
-            strength = float(np.sum((effect / now.mixed.noise[name].sd) ** 2))
-            everywhere += strength
-            if name == channel:
-                here += strength
-                parts.append(np.abs(effect * table.unit))
-    effect = np.concatenate(parts)
-    acting = effect[effect > JUDGE.acting * effect.max()]
-    if effect.max() < 1e-9 or not len(acting):
-        return 0.0, 0.0
-    return float(np.sqrt(np.mean(acting**2))), here / everywhere
 
 
 def implausible_explanations(now: Search, chosen: Sequence[str], scores: Mapping[str, float]) -> list[Implausible]:
@@ -579,19 +534,16 @@ def causes_of(search: Search, chosen: Sequence[str]) -> list[FoundCause]:
         rows = intervals(search, name, own, np.sqrt(variance * mixed.inflation.get(name, 1.0)))
         first = search.causes[name].parameters[0].name
         value, ci95, unit = rows[first].value, rows[first].ci95, rows[first].unit
-        score, share = round(search.part(chosen, name), 2), energy_share(search.lines, change)
+        score, share = round(search.contribution(chosen, name), 2), energy_share(search.lines, change)
         more = value - mixed.healthy_value(first)
         result.append(FoundCause(name, first, value, unit, ci95, more, share, score, parameters=rows))
     return result
 
 
 def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, ParameterEstimate]:
-    """The parameters of a cause after `change` (k,) [scales], known within `sd` and the error of the effect's form.
-
-    That error is twice as large in a circuit and four times as large in a network of lumps.
-    """
+    """The parameters of a cause after `change` (k,) [scales], known within `sd` and the error of the effect's form."""
     mixed, rows = search.mixed, {}
-    form = JUDGE.discrepancy * (1 + sum(LUMPED.get(c, 0) * share for c, share in search.shares[name].items()))
+    form = form_error(search.shares[name])
     for parameter, i, x, s in zip(search.causes[name].parameters, search.place[name], change, sd, strict=True):
         healthy, step = mixed.healthy_value(parameter.name), float(mixed.scale[i])
         wide = mixed.quantile * float(np.hypot(s, form * x))
@@ -599,6 +551,11 @@ def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, 
         value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing impossible
         rows[parameter.name] = ParameterEstimate(value, (low, high), parameter.unit)
     return rows
+
+
+def form_error(shares: Mapping[str, float]) -> float:
+    """Standard deviation of an effect that shows in channels by these shares: none has exactly its real form."""
+    return JUDGE.discrepancy * (1 + sum(LUMPED.get(channel, 0) * share for channel, share in shares.items()))
 
 
 def alternatives(now: Search, chosen: Sequence[str]) -> list[list[str]]:
@@ -611,7 +568,7 @@ def alternatives(now: Search, chosen: Sequence[str]) -> list[list[str]]:
         # the margin is on the scale of the less certain of the two
         margin = {n: JUDGE.margin * max(1.0, inflation.get(n, 1.0), inflation.get(name, 1.0)) for n in near}
         least = JUDGE.least_alternative * now.limit
-        others = [n for n, gain in near.items() if gain > own - margin[n] and now.step(rest, n) > least]
+        others = [n for n, gain in near.items() if gain > own - margin[n] and now.added_evidence(rest, n) > least]
         if not others:
             continue
         group = []
@@ -741,7 +698,7 @@ def judge(
     varying = {name for name in chosen if name in uneven or not carries_over(now, name)}
     found = [replace(cause, varies=cause.name in varying) for cause in causes_of(now, chosen)]
     sets = alternatives(now, chosen)
-    scores = {name: every.part(chosen, name) for name in every.causes}
+    scores = {name: every.contribution(chosen, name) for name in every.causes}
     notes = [*notes, *not_identifiable(problem), *map(str, now.rejected)]
     if now.winds is not None:
         name = now.winds.cause.name

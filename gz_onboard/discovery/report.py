@@ -16,7 +16,6 @@ from gz_onboard.discovery.judgement import (
     METRICS,
     VERDICTS,
     Discovery,
-    FoundCause,
     Report,
     Unknown,
     fitted,
@@ -196,17 +195,24 @@ def _findings(report: Report) -> list[tuple[str, str]]:
     return found + [("implausible", str(row)) for row in report.implausible]
 
 
-def _cause_lines(report: Report) -> list[str]:
-    lines = []
+def cause_rows(report: Report) -> list[list[str]]:
+    """Of each parameter of a cause: cause, parameter, value, 95 % interval; of the first change, energy and score."""
+    rows = []
     for c in report.causes:
         for name, p in c.parameters.items():
-            interval = f"95 %: {p.ci95[0]:.4g} to {p.ci95[1]:.4g}"
-            more = ""
+            row = ["", name, with_unit(p.value, p.unit), f"{p.ci95[0]:.4g} to {p.ci95[1]:.4g}", "", "", ""]
             if name == c.parameter:
-                interval += "" if c.change == c.value else f"; change {with_unit(c.change, c.unit, '+.4g')}"
-                more = f", {c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
-            called = c.name if name == c.parameter else ""
-            lines.append(f"  {called:20} {name} = {with_unit(p.value, p.unit)} ({interval}){more}")
+                row[0] = c.name
+                row[4:] = with_unit(c.change, c.unit, "+.4g"), f"{c.energy_share:+.1%}", f"{c.evidence:.0f}"
+            rows.append(row)
+    return rows
+
+
+def _cause_lines(report: Report) -> list[str]:
+    lines = []
+    for name, parameter, value, interval, change, share, score in cause_rows(report):
+        more = f"; change {change}), {share} of the energy, score {score}" if name else ")"
+        lines.append(f"  {name:20} {parameter} = {value} (95 %: {interval}{more}")
     return lines
 
 
@@ -248,7 +254,7 @@ def body(found: Discovery) -> str:
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
     channels = [name for name in CHANNEL if any(name in line.tables for line in found.search.lines)]
-    shown = _most(found, before, channels)
+    shown = _open_channels(found, channels)
     named = ", ".join(readable(cause.name) for cause in report.causes)
     parts = [
         _head(found),
@@ -295,15 +301,8 @@ def _head(found: Discovery) -> str:
 
 
 def _causes(report: Report) -> str:
-    text, rows = "", []
-    for c in report.causes:
-        for name, p in c.parameters.items():
-            first = name == c.parameter
-            of_cause = [with_unit(c.change, c.unit, "+.4g"), f"{c.energy_share:+.1%}", f"{c.evidence:.0f}"]
-            interval = f"{p.ci95[0]:.4g} to {p.ci95[1]:.4g}"
-            value = with_unit(p.value, p.unit)
-            rows.append([readable(c.name) if first else "", name, value, interval, *(of_cause if first else [""] * 3)])
-    if rows:
+    text = ""
+    if rows := [[readable(name), *row] for name, *row in cause_rows(report)]:
         heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
         text += (
             "<h2>Causes</h2>"
@@ -333,20 +332,14 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
     )
 
 
-def _most(found: Discovery, before: Sequence[LinearRide], channels: Sequence[str]) -> list[str]:
-    """The channels whose pictures are open: those that the causes change most, else the road's and the cells'."""
+def _open_channels(found: Discovery, channels: Sequence[str]) -> list[str]:
+    """The channels whose pictures are open: those with most of a cause's signal, else the road's and the cells'."""
     report = found.report
-    if not report.causes:
-        wanted = [report.unknown.channel] if report.unknown else []
-        return [c for c in (*wanted, "road_force", "cell_voltage") if c in channels][:2]
-
-    def weight(cause: FoundCause, channel: str) -> float:
-        index = found.search.mixed.index(cause.parameters)
-        tables = [line.tables[channel] for line in before if channel in line.tables]
-        noise = sum(float(np.sum(table.y**2)) for table in tables)
-        return sum(float(np.sum(table.a[:, index] ** 2)) for table in tables) / noise if noise > 0 else 0.0
-
-    return list(dict.fromkeys(max(channels, key=lambda name: weight(cause, name)) for cause in report.causes))
+    shares = [found.search.shares.get(cause.name) for cause in report.causes]
+    wanted = [max(share, key=lambda name: share[name]) for share in shares if share]
+    if not wanted:
+        wanted = [*([report.unknown.channel] if report.unknown else []), "road_force", "cell_voltage"][:2]
+    return [name for name in channels if name in wanted]
 
 
 def _gain(report: Report) -> str:

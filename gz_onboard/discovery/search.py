@@ -9,7 +9,7 @@ of a few healthy rides is not that of all, and the next rides may vary a quantit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,14 +39,14 @@ class SearchConfig:
     most_causes: int = 3  # that are named together
     exchanges: int = 3  # rounds of exchanging each cause for one that explains more
     alike: float = 0.6  # cosine of two columns
-    bend: float = 0.02  # of a cause's evidence: no effect has exactly its real form, and others take up the rest
+    form_error: float = 0.02  # of a cause's evidence: no effect has exactly its real form, and others take up the rest
     rounds: int = 5  # of linearisation
     settled: float = 0.03  # of a change: no further round for less
     most_fall: float = 3.0  # factor by which a parameter falls at once
-    sure: float = 2.0  # standard deviations beyond a bound, from which on a value is impossible
+    beyond_bounds: float = 2.0  # standard deviations beyond a bound, from which on a value is impossible
     scatter_rounds: int = 25  # of expectation and maximisation
     worse: float = 0.1  # ln of a mean square on rides held out: scatter
-    say: float = 0.1  # share of the evidence: a channel with less has no say
+    least_share: float = 0.1  # of the evidence: a channel with less does not count
     ratio_sd: float = 0.15  # by which the effect of a real cause differs between halves, on all rides
     ratio_ride_sd: float = 0.25  # and from ride to ride
     ratio: float = 0.5  # beyond which half of a cause is missing in one of the halves
@@ -79,7 +79,7 @@ class Winds:
     cause: Candidate
     score: float
     words: str
-    blown: Array
+    changes: Array
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Search:
     """A search for causes in rides: the candidates that these show, and the causes chosen so far.
 
     lines: linearised at `offset` (p,) in scales and seen from the values of `mixed`. causes: candidates. shares: of
-    each cause, by channel, its share of the signal. limit: the score that a cause must have. own: changes that are
-    each ride's own and stay, (p,) or (rides, p). chosen: causes, the surest first. winds: if they are no common cause.
+    each cause, by channel, its share of the signal. limit: the score that a cause must have. ride_changes: of single
+    rides, which stay, (p,) or (rides, p). chosen: causes, the surest first. winds: if they are no common cause.
     """
 
     mixed: MixedModel
@@ -97,7 +97,7 @@ class Search:
     shares: Mapping[str, Mapping[str, float]]
     limit: float
     offset: Array
-    own: Array
+    ride_changes: Array
     workers: int = 1
     chosen: tuple[str, ...] = ()
     rejected: tuple[Rejected, ...] = ()
@@ -151,38 +151,38 @@ class Search:
         np.fill_diagonal(cosines, 1.0)
         return 0.0 if np.min(cosines) < -SEARCH.alike else float(self.evidence.score[index] @ change)
 
-    def step(self, base: Sequence[str], name: str) -> float:
+    def added_evidence(self, base: Sequence[str], name: str) -> float:
         """The evidence that `name` adds to `base`, as chi-squared of one degree of freedom of healthy rides."""
         more = self.gain([*base, name]) - self.evidence.gain(self.index(base))
         more /= self.mixed.inflation.get(name, 1.0)
         k = len(self.place[name])
         return one_degree(more, k, self.mixed.freedom) if k > 1 else more
 
-    def part(self, chosen: Iterable[str], name: str) -> float:
-        """The evidence that `name` adds to the others of `chosen`: see `step`."""
-        return self.step([other for other in chosen if other != name], name)
+    def contribution(self, chosen: Iterable[str], name: str) -> float:
+        """The evidence that `name` adds to the others of `chosen`: see `added_evidence`."""
+        return self.added_evidence([other for other in chosen if other != name], name)
 
-    def least(self, base: Sequence[str], name: str) -> float:
+    def required_score(self, base: Sequence[str], name: str) -> float:
         """The score that `name` must have on top of `base`: more than a correction of the form of a large effect."""
         mine = self.shares.get(name, {})
-        bend = 0.0
+        error = 0.0
         for other in base:
             theirs = self.shares.get(other, {})
             common = sum(min(share, theirs.get(channel, 0.0)) for channel, share in mine.items())
-            bend += self.part(base, other) * common
-        return max(self.limit, SEARCH.bend * bend)
+            error += self.contribution(base, other) * common
+        return max(self.limit, SEARCH.form_error * error)
 
     def choose(self) -> tuple[str, ...]:
         """Causes one after the other, each exchanged for the one that explains more together with the rest."""
         chosen: list[str] = []
 
         def best(base: Sequence[str]) -> tuple[str, dict[str, float]]:
-            steps = {name: self.step(base, name) for name in self.causes if name not in base}
+            steps = {name: self.added_evidence(base, name) for name in self.causes if name not in base}
             return max(steps, key=lambda name: steps[name]), steps
 
         while len(chosen) < SEARCH.most_causes:
             new, steps = best(chosen)
-            if steps[new] < self.least(chosen, new):
+            if steps[new] < self.required_score(chosen, new):
                 break
             chosen.append(new)
             for _ in range(SEARCH.exchanges):
@@ -195,14 +195,14 @@ class Search:
                     break
         for old in list(chosen):
             rest = [name for name in chosen if name != old]
-            if rest and self.step(rest, old) < self.least(rest, old):
+            if rest and self.added_evidence(rest, old) < self.required_score(rest, old):
                 chosen.remove(old)
-        return tuple(sorted(chosen, key=lambda name: -self.part(chosen, name)))
+        return tuple(sorted(chosen, key=lambda name: -self.contribution(chosen, name)))
 
     def moved(self, offset: Array) -> Search:
         """The same search, linearised at another offset (p,)."""
         rides = [line.ride for line in self.lines]
-        lines = linearised_about(rides, self.mixed, offset + self.own, self.workers)
+        lines = linearised_about(rides, self.mixed, offset + self.ride_changes, self.workers)
         return replace(self, lines=lines, offset=offset)
 
     def selected(self) -> Search:
@@ -268,7 +268,8 @@ def _shares(
 
 # --- rides held out -------------------------------------------------------------------------------------------------
 
-Model = tuple[LinearRide, Array]  # a ride, less a curve, and its parameters (p,)
+Prediction = tuple[LinearRide, Array]  # a ride, less a curve, and its parameters (p,)
+ThreeModels = tuple[Prediction, Prediction, Prediction]  # before, with the control refitted, after
 
 
 def held_out(
@@ -278,7 +279,7 @@ def held_out(
     control: Sequence[Candidate] = (),
     form: CurveForm | None = None,
     folds: Iterable[Sequence[int]] | None = None,
-) -> Iterator[tuple[Model, Model, Model]]:
+) -> Iterator[ThreeModels]:
     """Of each ride in turn, held out of the fit: the model before, with `control` refitted, with `after` and `form`.
 
     Before: the causes of `control` alone are moved. Each ride has its own start. folds: the rides that are held out
@@ -327,14 +328,14 @@ def with_own_start(mixed: MixedModel, line: LinearRide, theta: Array) -> Array:
     return moved
 
 
-def worsened(held: Iterable[tuple[Model, Model, Model]], shares: Mapping[str, float]) -> dict[str, float]:
+def worsened(held: Iterable[ThreeModels], shares: Mapping[str, float]) -> dict[str, float]:
     """How much worse rides held out are predicted after than before or with the control, whichever is better.
 
     ln of the ratio of mean squares, negative if better, of each channel that has a share of the evidence.
     """
     squares: dict[str, list[list[float]]] = {}
     for models in held:
-        for name in (name for name, share in shares.items() if share > SEARCH.say):
+        for name in (name for name, share in shares.items() if share > SEARCH.least_share):
             tables = [(line.tables.get(name), theta) for line, theta in models]
             row = [float(np.mean((t.y - t.a @ theta) ** 2)) for t, theta in tables if t is not None]
             if row:
@@ -343,12 +344,12 @@ def worsened(held: Iterable[tuple[Model, Model, Model]], shares: Mapping[str, fl
     return {name: float(np.log(after / min(before, control))) for name, (before, control, after) in sums.items()}
 
 
-def improves(held: Iterable[tuple[Model, Model, Model]], shares: Mapping[str, float]) -> bool:
+def improves(held: Iterable[ThreeModels], shares: Mapping[str, float]) -> bool:
     """Whether rides held out are predicted better in all channels together, each by its share."""
     return sum(shares[channel] * more for channel, more in worsened(held, shares).items()) < 0
 
 
-def held_out_with(now: Search, name: str) -> Iterator[tuple[Model, Model, Model]]:
+def held_out_with(now: Search, name: str) -> Iterator[ThreeModels]:
     """Rides held out with `name` among the causes chosen; the control is without it."""
     causes = [now.causes[n] for n in now.chosen]
     return held_out(now.mixed, now.lines, causes, [c for c in causes if c.name != name])
@@ -384,29 +385,19 @@ class Split:
         return self.quantity.startswith(RIDE_PREFIX)
 
 
-Sign = Callable[[LinearRide, LinearChannel, Array], Array]
+def _sides(quantity: str, line: LinearRide, table: LinearChannel, effect: Array) -> Array:
+    """The half of `quantity` that each block is in, -1 to 1, (m,); of one ride, 1 there and 0 in the others.
 
-
-def _side(line: LinearRide, table: LinearChannel, effect: Array) -> Array:
-    """+1 in left bends, -1 in right ones, 0 on the straight."""
-    return np.asarray(np.tanh(table.over(line.ride.quantities["lateral_acceleration"]) / SEARCH.bend_acceleration))
-
-
-def _halves(name: str) -> Sign:
-    """-1 below a value of the quantity, +1 above it, half of the cause's squared effect on either side."""
-
-    def sign(line: LinearRide, table: LinearChannel, effect: Array) -> Array:
-        at = table.over(line.ride.quantities[name])
-        order = np.argsort(at)
-        half = np.cumsum(effect[order] ** 2)
-        return np.asarray(np.sign(at - at[order][np.searchsorted(half, half[-1] / 2)]))
-
-    return sign
-
-
-def _in_ride(mine: LinearRide) -> Sign:
-    """1 in one ride, 0 in the others."""
-    return lambda line, table, effect: np.full(len(effect), 1.0 if line is mine else 0.0)
+    Either half has half of the squared `effect` (m,); in bends it is the side, and 0 on the straight.
+    """
+    if quantity.startswith(RIDE_PREFIX):
+        return np.full(len(effect), float(quantity == f"{RIDE_PREFIX}{line.ride.name}"))
+    at = table.over(line.ride.quantities[quantity])
+    if quantity == "lateral_acceleration":
+        return np.asarray(np.tanh(at / SEARCH.bend_acceleration))
+    order = np.argsort(at)
+    half = np.cumsum(effect[order] ** 2)
+    return np.asarray(np.sign(at - at[order][np.searchsorted(half, half[-1] / 2)]))
 
 
 def splits(now: Search) -> list[Split]:
@@ -415,27 +406,28 @@ def splits(now: Search) -> list[Split]:
     Its columns are split in two, and the difference of the halves becomes a parameter, the `ratio` to their mean:
     0 for the cause itself, ±1 for what acts in one half only (constancy of a coefficient: Chow 1960; Hansen 1992).
     """
-    halves = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
     found = []
     for name in now.chosen:
-        tests = dict(halves)
+        quantities = ["lateral_acceleration", "time", "speed"]
         if len(now.lines) > 2 and not now.causes[name].varies:
-            tests |= {f"{RIDE_PREFIX}{line.ride.name}": _in_ride(line) for line in now.lines}
-        for quantity, sign in tests.items():
-            inner, score = _split(now, now.place[name], sign)
+            quantities += [f"{RIDE_PREFIX}{line.ride.name}" for line in now.lines]
+        for quantity in quantities:
+            inner, score = _split(now, now.place[name], quantity)
             if inner > 1e-6:  # else no ride shows it
                 found.append(Split(name, quantity, score / inner, score * score / inner))
     return found
 
 
-def _split(now: Search, index: Sequence[int], sign: Sign) -> tuple[float, float]:
+def _split(now: Search, index: Sequence[int], quantity: str) -> tuple[float, float]:
     """(information, score) of the ratio of the halves of the effect of the parameters at `index`."""
     mixed, change, rides = now.mixed, now.change[index], []
     for line in now.lines:
         more = line.statistics.padded(1)
         for name, table in line.tables.items():
             effect = table.a[:, index] @ change
-            column = effect * sign(line, table, effect) if np.any(effect) else effect
+            if not np.any(effect):
+                continue
+            column = effect * _sides(quantity, line, table, effect)
             if np.any(column):
                 more = more.with_columns(table, mixed.noise[name], column[:, None])
         rides.append(more)
@@ -461,7 +453,7 @@ def within_bounds(mixed: MixedModel, cause: Candidate, change: Iterable[float], 
     for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
         (i,) = mixed.index([parameter.name])
         step = float(mixed.scale[i])
-        value, spread = mixed.values[parameter.name] + x * step, SEARCH.sure * s * step
+        value, spread = mixed.values[parameter.name] + x * step, SEARCH.beyond_bounds * s * step
         inside = parameter.low - spread <= value <= parameter.high + spread
         if not inside and parameter.name not in LOG_SCALED:
             return False
@@ -476,7 +468,7 @@ def rejection(now: Search) -> Rejected | None:
     uneven = set() if mixed.healthy else {split.cause for split in splits(now) if split.unequal and split.of_ride}
     found: list[tuple[float, str, Rejected]] = []
     for name, (change, variance) in now.fitted(now.chosen).items():
-        score, why = strict.part(now.chosen, name), ""
+        score, why = strict.contribution(now.chosen, name), ""
         if not within_bounds(mixed, now.causes[name], change, np.sqrt(variance)):
             why = IMPOSSIBLE
         elif score < now.limit:
@@ -522,7 +514,7 @@ def search_causes(problem: Search) -> Search:
 def own_winds(now: Search, wind: Candidate) -> Winds:
     """The wind of each ride. It blows otherwise on another day, so that one vector common to the rides misses it."""
     mixed, w = now.mixed, now.mixed.index(wind.names)
-    blown = np.zeros((len(now.lines), len(mixed.mean)))
+    changes = np.zeros((len(now.lines), len(mixed.mean)))
     rest = [i for i in range(len(mixed.mean)) if i not in w]
     spread = mixed.prior + np.diag(mixed.scatter)
     inside = np.zeros_like(spread)
@@ -536,13 +528,13 @@ def own_winds(now: Search, wind: Candidate) -> Winds:
         covariance = np.linalg.inv(inside + shown.information)
         own = (covariance @ (shown.score + inside @ mean))[w] - mean[w]
         total += float(own @ np.linalg.solve(spread[np.ix_(w, w)] + covariance[np.ix_(w, w)], own))
-        blown[i, w] = own
+        changes[i, w] = own
         north, east = (own * mixed.scale[w]).tolist()
         words.append(
             f"{line.ride.name} {np.hypot(north, east):.1f} m/s from {np.degrees(np.arctan2(east, north)) % 360:.0f}°"
         )
     score = one_degree(total, 2 * len(words), mixed.freedom) if words else 0.0
-    return Winds(wind, score, ", ".join(words), blown)
+    return Winds(wind, score, ", ".join(words), changes)
 
 
 def with_winds(problem: Search, winds: Winds) -> Search:
@@ -553,12 +545,12 @@ def with_winds(problem: Search, winds: Winds) -> Search:
     mixed = problem.mixed
     w = mixed.index(winds.cause.names)
     scatter = mixed.scatter.copy()
-    scatter[w] = np.maximum(scatter[w], np.mean(winds.blown[:, w] ** 2, axis=0))
+    scatter[w] = np.maximum(scatter[w], np.mean(winds.changes[:, w] ** 2, axis=0))
     speeds = [np.abs(line.ride.quantities["speed"]) for line in problem.lines]
     mean_square = np.array([np.mean(speed[speed > MOVING]) for speed in speeds]) ** 2
-    square = np.sum((winds.blown[:, w] * mixed.scale[w]) ** 2, axis=1) / mean_square
+    square = np.sum((winds.changes[:, w] * mixed.scale[w]) ** 2, axis=1) / mean_square
     for i in mixed.index([name for name in winds.cause.reads if name in mixed.names]):
         share = SEARCH.side_wind * square * mixed.values[mixed.names[i]] / mixed.scale[i]
         scatter[i] += np.mean(share**2)
-    windy = replace(problem, mixed=replace(mixed, scatter=scatter), own=winds.blown)
+    windy = replace(problem, mixed=replace(mixed, scatter=scatter), ride_changes=winds.changes)
     return windy.moved(problem.offset)
