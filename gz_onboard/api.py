@@ -59,8 +59,8 @@ from gz_onboard.simulation.simulate import variant
 from gz_onboard.simulation.summary import SimulationSummary, Variant, summarise, summary_text, variants_text
 from gz_onboard.simulation.sweep import Sweep, grid, sweep_of
 from gz_onboard.validation.comparison import ValidatedRide
+from gz_onboard.validation.report import markdown, ride_text
 from gz_onboard.validation.ride import compare_ride
-from gz_onboard.validation.tables import markdown, ride_text
 from gz_onboard.vehicle import Vehicle
 from gz_onboard.vehicle_check.check import Checked, RoleSeen, check_log, check_text
 from gz_onboard.vehicle_check.command import roles_text

@@ -18,15 +18,15 @@ from gz_onboard.progress import progress_bar
 from gz_onboard.reports.page import mark_of, write_below
 from gz_onboard.reports.results import descriptions, write_json
 from gz_onboard.validation.comparison import SimulationVerdict, ValidatedRide, pool
+from gz_onboard.validation.report import markdown, ride_text, write_report
 from gz_onboard.validation.ride import PICTURE, validate_ride
-from gz_onboard.validation.tables import markdown, ride_text, write_report
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
-SUMMARY_VERSION = 1
+SUMMARY_VERSION = 2
 PAGE = "validation.html"
 MAKER = "gz-onboard validate"
 KEYS = descriptions(SimulationVerdict) | descriptions(ValidatedRide)
-"""Keys of a ride in ``--json``: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
+"""Keys of a ride in ``--json``: {"version", "rides", "pooled": of all rides, "failed": [{file, error}]}."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

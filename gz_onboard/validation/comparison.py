@@ -129,16 +129,18 @@ class Comparison:
             passed=percent is not None and percent <= limit,
         )
 
-    def split(self, conditions: Conditions) -> Splits:
+    def split(self, form: str, channel: str, conditions: Conditions) -> list[Means]:
         """The means in each condition of enough seconds."""
         n = len(self.measured)
-        result: Splits = {}
-        for by, masks in conditions.items():
-            for name, mask in masks.items():
+        found = []
+        for sorting, masks in conditions.items():
+            for condition, mask in masks.items():
                 inside = mask[:n] & self.valid
                 if inside.sum() >= CONFIG.least_seconds:
-                    result.setdefault(by, {})[name] = Means.of(self.measured[inside], self.error[inside])
-        return result
+                    measured, error = self.measured[inside], self.error[inside]
+                    means = (float(x.mean()) for x in (measured, error, np.abs(error), np.abs(measured)))
+                    found.append(Means(form, channel, sorting, condition, len(error), *means))
+        return found
 
 
 # --- results ------------------------------------------------------------------------------------------------------
@@ -219,24 +221,24 @@ class SocReference:
 
 @dataclass(frozen=True)
 class Means:
-    """A quantity over the seconds of one condition; errors are simulated less measured."""
+    """A channel over the seconds of one riding condition; errors are simulated less measured."""
 
+    form: str
+    channel: str
+    sorting: str
+    condition: str
     seconds: int
     mean_measured: float
     mean_error: float
     mean_abs_error: float
     mean_abs_measured: float
 
-    @classmethod
-    def of(cls, measured: Array, error: Array) -> Means:
-        """The means of arrays of shape (n,)."""
-        return cls(len(error), *(float(x.mean()) for x in (measured, error, np.abs(error), np.abs(measured))))
-
 
 @dataclass(frozen=True)
 class PooledMeans(Means):
     """The same over several rides. percent: mean magnitude of the error, bias_percent: its mean, of the measured."""
 
+    on_dynamometer: bool
     rides: int
     percent: float
     bias_percent: float
@@ -244,10 +246,6 @@ class PooledMeans(Means):
 
 Conditions = Mapping[str, Mapping[str, Mask]]
 """The seconds of each condition, by sorting."""
-Splits = dict[str, dict[str, Means]]
-"""Means by sorting and condition."""
-Pooled = dict[str, dict[str, dict[str, dict[str, dict[str, PooledMeans]]]]]
-"""``road`` or ``dynamometer``: by form, channel, sorting and condition."""
 
 
 @dataclass(frozen=True)
@@ -273,8 +271,8 @@ class ValidatedRide:
     predictive: Annotated[SimulationVerdict, "simulated with the rider model following the measured speed: the same"]
     components: Annotated[Verdict | None, "each by itself, with measured inputs: channels, passed; or null"]
     splits: Annotated[
-        dict[str, dict[str, Splits]],
-        "by form, channel, sorting and condition: seconds, mean_measured, mean_error, mean_abs_error, "
+        list[Means],
+        "of each form, channel, sorting and condition: seconds, mean_measured, mean_error, mean_abs_error, "
         "mean_abs_measured",
     ]
     cells_series: Annotated[int, "cells in series, whose voltages make the pack's"]
@@ -367,33 +365,26 @@ def riding_conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str
     return found, missing
 
 
-def pooled(parts: Sequence[Means]) -> PooledMeans:
-    """The means of several rides as those of one, every second alike."""
+def pooled(parts: Sequence[Means], on_dynamometer: bool = False) -> PooledMeans:
+    """The means of several rides in one condition as those of one, every second alike."""
     seconds = [part.seconds for part in parts]
     names = ("mean_measured", "mean_error", "mean_abs_error", "mean_abs_measured")
     means = {name: float(np.average([getattr(part, name) for part in parts], weights=seconds)) for name in names}
     scale = 100 / means["mean_abs_measured"] if means["mean_abs_measured"] else 0.0
     return PooledMeans(
-        seconds=sum(seconds),
-        **means,
+        **{**vars(parts[0]), **means, "seconds": sum(seconds)},
+        on_dynamometer=on_dynamometer,
         rides=len(parts),
         percent=scale * means["mean_abs_error"],
         bias_percent=scale * means["mean_error"],
     )
 
 
-def pool(rides: Sequence[ValidatedRide]) -> Pooled:
-    """The splits of all rides as one, apart for road and dynamometer."""
-    parts: dict[tuple[str, ...], list[Means]] = {}
+def pool(rides: Sequence[ValidatedRide]) -> list[PooledMeans]:
+    """The splits of all rides as one, those on the road first, those on a dynamometer apart."""
+    parts: dict[tuple[bool, str, str, str, str], list[Means]] = {}
     for ride in sorted(rides, key=lambda ride: ride.on_dynamometer):
-        where = "dynamometer" if ride.on_dynamometer else "road"
-        for form, channels in ride.splits.items():
-            for channel, sortings in channels.items():
-                for by, kinds in sortings.items():
-                    for kind, means in kinds.items():
-                        parts.setdefault((where, form, channel, by, kind), []).append(means)
-    result: Pooled = {}
-    for (where, form, channel, by, kind), found in parts.items():
-        forms = result.setdefault(where, {}).setdefault(form, {})
-        forms.setdefault(channel, {}).setdefault(by, {})[kind] = pooled(found)
-    return result
+        for means in ride.splits:
+            key = ride.on_dynamometer, means.form, means.channel, means.sorting, means.condition
+            parts.setdefault(key, []).append(means)
+    return [pooled(found, on_dynamometer) for (on_dynamometer, *_), found in parts.items()]

@@ -23,12 +23,14 @@ from gz_onboard.model.effect import MOVING, ROAD_LOAD, Port
 from gz_onboard.model.model import air_density, drag_torque
 from gz_onboard.model.series import (
     all_quantities,
+    curve_over,
     heat,
     idle_loss,
+    mesh_over,
     ocv_over,
     over,
+    relaxation,
     reversible_heat_over,
-    stepper,
     terminal_voltage,
     total,
 )
@@ -86,34 +88,30 @@ def time_moving(measured: Mapping[str, Array]) -> Array:
 
 
 def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
-    """Pack voltage [V] per second by the circuit of `model.battery`, at rest before the first."""
-    battery = vehicle.pack
-    m = battery.cells_parallel
-    columns = (
-        measured["pack_current"],
-        measured["cell_temperature"],
-        vibration(vehicle, measured),
-        time_moving(measured),
-    )
-    v1, result = 0.0, np.empty(len(columns[0]))
-    effects, q = stepper(vehicle.model.at(Port.CELL_VOLTAGE), 0.5), all_quantities()
-    rows = zip(*(column.tolist() for column in columns), strict=True)
-    for i, (amperes, celsius, shaken, moving) in enumerate(rows):
-        cell = amperes / m
-        r0, r1, c1 = battery.circuit(soc, celsius)
-        decay = np.exp(-0.5 / (r1 * c1))
-        v1 = decay * v1 + (1 - decay) * r1 * cell  # to its middle, as measurements are means of a second
-        half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
-        soc -= half
-        q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken, "time_moving": moving}
-        q["cell_capacity"] = battery.cell_capacity(celsius)
-        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + sum(effects(q)))
-        result[i] = battery.pack_voltage(volts, amperes)
-        v1 = decay * v1 + (1 - decay) * r1 * cell
-        soc -= half
-        q["soc"] = soc
-        effects(q)
-    return result
+    """Pack voltage [V] in the middle of each second by the circuit of `model.battery`, at rest before the first.
+
+    Resistances are those at the second's begin; RC pair and effects go in steps of half a second.
+    """
+    battery, amperes, celsius = vehicle.pack, measured["pack_current"], measured["cell_temperature"]
+    cell = amperes / battery.cells_parallel
+    capacity = battery.capacity * battery.health.capacity * curve_over(battery.capacity_share, celsius)
+    drawn = discharged(cell, 1.0, capacity)
+    ends = soc - np.cumsum(drawn)
+    middles, starts = ends + drawn / 2, ends + drawn
+    r0, r1, c1 = (mesh_over(table, starts, celsius) for table in (battery.r0, battery.r1, battery.c1))
+    v1 = relaxation(np.repeat(r1 * cell, 2), np.repeat(np.exp(-0.5 / (r1 * c1)), 2))
+    halves = {
+        "cell_current": cell,
+        "cell_temperature": celsius,
+        "cell_capacity": capacity,
+        "vibration": vibration(vehicle, measured),
+        "time_moving": time_moving(measured),
+    }
+    q = all_quantities(**{name: np.repeat(values, 2) for name, values in halves.items()})
+    q["soc"] = np.column_stack([middles, ends]).ravel()
+    extra = v1 + total(vehicle.model.at(Port.CELL_VOLTAGE), q, over(0.5))
+    volts = terminal_voltage(ocv_over(battery, middles, celsius), r0, cell, extra[::2])
+    return np.asarray(battery.pack_voltage(volts, amperes))
 
 
 def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -> tuple[Array, Array, Array]:

@@ -40,6 +40,7 @@ from gz_onboard.validation.comparison import (
     riding_conditions,
 )
 from gz_onboard.validation.components import components, losses
+from gz_onboard.validation.report import draw_ride
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 PICTURE = ".validation"
@@ -104,8 +105,6 @@ def validate_ride(task: Task) -> ValidatedRide:
     picture = task.drawn(PICTURE)
     if not picture:
         return compared.result
-    from gz_onboard.validation.picture import draw_ride
-
     result = replace(compared.result, plot=str(picture))
     with writing(picture):
         draw_ride(picture, result, compared.comparisons)
@@ -135,11 +134,11 @@ def compare_ride(log: Path, vehicle: Vehicle) -> ComparedRide:
     missing += _not_judged(ride, commands)
     missing += [_empty_text(form, end, recorded.duration) for form, end in ends.items() if end]
     comparisons["components"] = alone
-    splits = {}
+    splits = []
     for form, compared in comparisons.items():
         end = ends.get(form)
-        until = end.compared_s if end else None
-        splits[form] = {name: comparison.until(until).split(conditions) for name, comparison in compared.items()}
+        for channel, comparison in compared.items():
+            splits += comparison.until(end.compared_s if end else None).split(form, channel, conditions)
     voltage, kind = alone.get("battery_voltage"), facts_of(log).get("kind")
     result = ValidatedRide(
         file=str(log),

@@ -1,22 +1,28 @@
-"""The tables of a validation: its page, Markdown, the text for a terminal, and the comparison with the thesis."""
+"""The report of a validation: its page, pictures, Markdown, the text for a terminal, the comparison with the thesis."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.reports.page import Failed, Subheading, html_table, image, markdown_table, write_page
 from gz_onboard.reports.results import number
-from gz_onboard.validation import comparison
+from gz_onboard.reports.style import BLUE, GREEN, INK, ORANGE, ChartPanel, Line, chart, save, time_unit
+from gz_onboard.validation import comparison as definitions
 from gz_onboard.validation.comparison import (
+    CHANNELS,
     CONFIG,
     FORMS,
     LABELS,
     ORDER,
     ChannelErrors,
-    Pooled,
+    Comparison,
+    PooledMeans,
     SimulationVerdict,
     ValidatedRide,
     Verdict,
@@ -42,7 +48,7 @@ MEANINGS = {
 """Meaning of a form that does not pass."""
 
 
-def write_report(file: Path, rides: Sequence[ValidatedRide], together: Pooled) -> None:
+def write_report(file: Path, rides: Sequence[ValidatedRide], together: Sequence[PooledMeans]) -> None:
     """Write the page: errors against their limits, errors by condition, each ride's picture. Raises OSError."""
     limits = f"each channel within {CONFIG.gate_percent:g} %, each component within {CONFIG.component_gate_percent:g} %"
     parts = [f"<p>{sum(ride.passed for ride in rides)} of {len(rides)} rides pass: {limits}.</p>"]
@@ -50,12 +56,13 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Pooled) -
         numbers = range(1, len(heads)) if heads != THESIS_HEADS else ()
         parts.append(f"<h2>{title}</h2>{html_table(heads, rows, numbers)}")
     parts.append("<h2>Where the model fails</h2>")
-    for where in together:
-        heads, rows = by_condition(together, where)
+    for on_dynamometer in sorted({ride.on_dynamometer for ride in rides}):
+        heads, rows = by_condition([means for means in together if means.on_dynamometer == on_dynamometer])
+        where = "dynamometer" if on_dynamometer else "road"
         parts.append(f"<h3>On the {where}</h3>{html_table(heads, rows, range(1, len(heads)))}")
     parts.append("<h2>Not judged</h2><ul>")
     parts += [f"<li>{html.escape(r.name)}: {html.escape(text)}</li>" for r in rides for text in r.missing]
-    parts.append(f"</ul><h2>Definitions</h2><pre>{html.escape(comparison.__doc__ or '')}</pre>")
+    parts.append(f"</ul><h2>Definitions</h2><pre>{html.escape(definitions.__doc__ or '')}</pre>")
     parts += [f"<h2>{html.escape(ride.name)}</h2>{image(Path(ride.plot))}" for ride in rides if ride.plot]
     write_page(file, f"Validation of {rides[0].vehicle}", parts)
 
@@ -139,16 +146,16 @@ def _charge(rides: Sequence[ValidatedRide]) -> Table:
     return heads, rows
 
 
-def by_condition(together: Pooled, where: str) -> Table:
+def by_condition(together: Sequence[PooledMeans]) -> Table:
     """Mean error of `COLUMNS` in each riding condition, and in percent of the mean magnitude."""
+    means = {(m.form, m.channel, m.condition): m for m in together}
     rows: list[list[str]] = []
-    for by, label in LABELS.items():
-        columns = [together[where].get(form, {}).get(channel, {}).get(by, {}) for form, channel, _ in COLUMNS]
-        kinds = sorted({kind for column in columns for kind in column}, key=ORDER.index)
+    for sorting, label in LABELS.items():
+        kinds = {m.condition for m in together if m.sorting == sorting}
         rows += [[Subheading(label)]] if kinds else []
-        for kind in kinds:
-            found = [column.get(kind) for column in columns]
-            seconds = max(means.seconds for means in found if means)
+        for kind in sorted(kinds, key=ORDER.index):
+            found = [means.get((form, channel, kind)) for form, channel, _ in COLUMNS]
+            seconds = max((m.seconds for m in found if m), default=0)
             cells = [f"{m.mean_error:+.3g} ({m.bias_percent:+.1f} %)" if m else "–" for m in found]
             rows.append([kind, f"{seconds / 60:.0f}", *cells])
     return ["condition", "min", *(head for *_, head in COLUMNS)], rows
@@ -273,3 +280,54 @@ def _energy_text(verdict: Verdict) -> str:
     if end := verdict.pack_empty:
         known += f" until {end.compared_s:.0f} s; the simulated pack is empty at {end.time_s:.0f} s"
     return known.strip()
+
+
+# --- the picture of a ride ---------------------------------------------------------------------------------------
+
+COLOURS = {"open_loop": ORANGE, "predictive": BLUE, "components": GREEN}
+AVERAGED_S = 30
+"""Averages gears and gusts out of an error."""
+_DPI = 90  # of a wide picture
+
+
+def draw_ride(file: Path, ride: ValidatedRide, comparisons: Mapping[str, Mapping[str, Comparison]]) -> None:
+    """Draw each quantity measured and simulated on the left, the errors on the right. Raises OSError."""
+    found: dict[str, dict[str, Comparison]] = {channel.label: {} for channel in CHANNELS.values()}
+    for form, by_name in comparisons.items():
+        for name, comparison in by_name.items():
+            if name != "pack_power":
+                found.setdefault(comparison.quantity.label, {})[form] = comparison
+    unit, x_name = time_unit(ride.duration_s)
+    rows = [_row(forms, unit) for forms in found.values() if forms]
+    x = np.array([0.0, ride.duration_s / unit])
+    air = "" if ride.ambient_c is None else f", air {ride.ambient_c:.0f} °C"
+    title = f"{ride.name} · {ride.vehicle}, {ride.payload_kg:g} kg{air}, {ride.distance_km:.1f} km"
+    about = f"left: measured and simulated; right: simulated less measured, each second and the mean of {AVERAGED_S} s"
+    save(chart(rows, x, x_name, title, about, left=0.055), file, _DPI)
+
+
+def _row(forms: Mapping[str, Comparison], unit: float) -> tuple[ChartPanel, ChartPanel]:
+    """Values and errors of one quantity, over time in `unit` [s]."""
+    values: list[Line] = []
+    errors: list[Line] = []
+    for form, comparison in forms.items():
+        time, colour, name = np.arange(len(comparison.valid)) / unit, COLOURS[form], FORMS[form]
+        measured, modelled, error = (
+            np.where(comparison.valid, y, np.nan) for y in (comparison.measured, comparison.modelled, comparison.error)
+        )
+        values += [] if values else [Line(measured, INK, "measured", x=time)]
+        values.append(Line(modelled, colour, name, 0.9, x=time))
+        errors.append(Line(error, colour, f"_{name}", 0.2, x=time))
+        errors.append(Line(_mean(comparison), colour, name, 1.5, x=time))
+    quantity = next(iter(forms.values())).quantity
+    name = f"{quantity.label}\n[{quantity.unit.replace('degC', '°C')}]"
+    return ChartPanel(name, values, 1.25), ChartPanel("", errors, 1.25, zero=True)
+
+
+def _mean(comparison: Comparison) -> Array:
+    """The error, averaged over `AVERAGED_S` where most of it is known."""
+    n = len(comparison.valid)
+    wide = np.ones(min(AVERAGED_S, max(n // 4, 1)))
+    count = np.convolve(comparison.valid, wide, "same")
+    total = np.convolve(np.where(comparison.valid, comparison.error, 0.0), wide, "same")
+    return np.where(count > len(wide) / 4, total / np.maximum(count, 1), np.nan)
