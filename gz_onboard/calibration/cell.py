@@ -1,8 +1,8 @@
 """Bench tests of one cell, and open-circuit voltage and capacity from a slow one (Lord 2016, sec. 2.2).
 
-A slow test is full, rest, discharge, rest, charge. At one state of charge the mean of both branches is free of what has
-the current's sign, resistance and hysteresis. Half their gap, less the part that resistance makes, is how far the
-open-circuit voltage depends on history (Plett 2015, vol. 1, sec. 2.8 and 2.10): the standard deviation given.
+A slow test is full, rest, discharge, rest, charge. At one state of charge the mean of both branches is free of
+resistance and hysteresis, which have the current's sign. Half their gap, less the part that resistance makes, is how
+far the open-circuit voltage depends on history (Plett 2015, vol. 1, sec. 2.8 and 2.10): the standard deviation given.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gz_onboard.model.tables import LIMITS
 
 @dataclass(frozen=True)
 class CellTestConfig:
-    """What a test of a cell must be like; currents are relative to the largest of the test."""
+    """Requirements of a test of a cell; currents are relative to the largest of the test."""
 
     fewest_samples: int = 50
     voltage: tuple[float, float] = (0.2, 6.0)  # V: one cell of any chemistry, under any load

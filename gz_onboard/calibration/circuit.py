@@ -6,7 +6,7 @@ V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); the shift is zero unless rests s
 `charge_transfer`) unless pulses of several currents do. I is the cell's current [A], positive when discharging.
 
 With the time constants and η given, V is linear in every table: the fit has one minimum and needs no start. The pairs
-span what a test shows, charge transfer in a second to diffusion in half an hour (a discrete distribution of relaxation
+span a test, from charge transfer in a second to diffusion in half an hour (a discrete distribution of relaxation
 times: Schmidt et al. 2013). One pair cannot follow all of that; which part it should depends on the load, so it is the
 one whose voltage is nearest under a given current, node by node.
 """
@@ -62,7 +62,7 @@ class Reaction:
     time: float = 1.0
 
     def overpotential(self, flowed: Array, dt: Array, temperature: Array) -> Array:
-        """What it takes from the voltage (m,) [V] of a cell that has rested.
+        """Overpotential (m,) [V] of a cell that has rested.
 
         flowed: the mean current [A] over the `dt` [s] before each sample, temperature [degC]; all (m,).
         """
@@ -101,7 +101,7 @@ class Circuit:
     reaction: Reaction = NO_REACTION
 
     def ocv_shift(self, temperature: Array) -> Array:
-        """What the open-circuit voltage (m,) [V] is above `ocv` at `temperature` (m,) [degC]."""
+        """Open-circuit voltage less `ocv` (m,) [V] at `temperature` (m,) [degC]."""
         if self.rest_shift is None:
             return np.zeros(np.shape(temperature))
         return np.asarray(np.interp(temperature, self.temperature, self.rest_shift))
@@ -157,7 +157,7 @@ def riding_current(duration: int = 1200, seed: int = 1) -> Array:
     """A current (duration,) [any unit, each for 1 s] such as a scooter in town draws, after a minute's rest.
 
     Pulling away, cruising, braking with recuperation, waiting, with shares of time and of current as in
-    urban riding (mean over RMS about 0.6). Only its shape counts: what is reduced over it is linear.
+    urban riding (mean over RMS about 0.6). Only its shape counts: the reduction over it is linear.
     """
     rng = np.random.default_rng(seed)
     parts = [np.zeros(60)]
@@ -194,7 +194,7 @@ class Branches:
     """The pairs at one temperature.
 
     resistance: (1 + len(TIMES), n) [ohm], R0 first; shift: (n,) [V] of the rest voltage against the OCV.
-    covariance: (n,) of those of the resistances at a node, from the scatter of what the pieces leave over, as if a
+    covariance: (n,) of those of the resistances at a node, from the scatter of the pieces' residuals, as if a
     resistance could be negative; it weighs nodes against each other. without: (2, pieces, 2 + len(TIMES), n), both with
     `left_out` of each piece left out, if that was asked for. shift_prior: (n,) [V], the sd of the shift that the
     priors' own doubt leaves. covered: (n,), False at nodes without a pulse near.
@@ -250,7 +250,7 @@ def pieces(
 def weighted_columns(
     test: CellTest, ocv: tuple[Array, Array], relaxing: Array, warm: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array]:
-    """(what the voltage is of R0, each pair and the shift at every sample, (m, 2 + len(TIMES)); weights (m,)).
+    """(derivatives of the voltage by R0, each pair and the shift, (m, 2 + len(TIMES)); weights (m,)).
 
     ocv, relaxing: see `pieces`. warm: factors (m,) on R0 and on the pairs.
     """
@@ -299,10 +299,10 @@ def _positive(normal: Array, right: Array, n: int) -> Array:
 
 
 def jackknife(whole: Array, without: Array) -> Array:
-    """The sd of `whole` (...) from what it is with `left_out` of each piece of the data left out, (2, pieces, ...).
+    """The sd of `whole` (...) from its values with `left_out` of each piece of the data left out, (2, pieces, ...).
 
-    A piece pulls the fit towards itself, by its leverage h. Leaving out a little of it moves the fit by what the piece
-    leaves over, whose variance is (1 - h)·σ²: too little. Leaving it out whole, as the jackknife does, moves it by
+    A piece pulls the fit towards itself, by its leverage h. Leaving out a little of it moves the fit by the residual
+    of the piece, whose variance is (1 - h)·σ²: too little. Leaving it out whole, as the jackknife does, moves it by
     1/(1 - h) of that: too much. The product of both has the mean σ² (HC2 of MacKinnon & White 1985).
     """
     little, all_of_it = ((x - whole) / part for x, part in zip(without, PAIR_FIT.left_out, strict=True))

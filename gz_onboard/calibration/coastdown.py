@@ -3,8 +3,8 @@
     (m + J/r²)·dV/dt = -m·g·(c0·cos θ + c1·V + sin θ) - ½·ρ·CdA·(V + w)·|V + w| - P_motor(V/r)/V
 
 Runs in both directions of one track: its slope changes sign with the direction, the rest does not. Each run has a
-constant headwind w of its own, unknown but for a prior. The motor turns with the wheel: what it takes without current
-is taken off by the vehicle's own motor model. Air density is that of the measured temperature and altitude.
+constant headwind w, unknown but for a prior. The motor turns with the wheel: its drag without current is taken off by
+the vehicle's motor model. Air density is that of the measured temperature and altitude.
 
 Force over spans of two seconds is fitted by generalised least squares, all runs at once. The residual has two parts,
 both found by maximum likelihood: gusts, whose force grows with speed and lasts some seconds, and noise of the speed,
@@ -42,13 +42,13 @@ from gz_onboard.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class CoastdownConfig:
-    """Which part of a run counts, and what is known without it."""
+    """Which part of a run counts, and priors."""
 
     span: float = 2.0  # s
     slowest: float = 1.0  # m/s: down to it the run is fitted
     shortest: float = 10.0  # s
     least_fall: float = 3.0  # m/s
-    driving: float = 0.01  # of the motor's greatest current, beside its offset: mean of a span of coasting
+    driving: float = 0.01  # of the motor's greatest current, without its offset: mean of a span of coasting
     rising: float = 0.2  # m/s from one `rise_time` to the next: noise of a mean is less
     rise_time: float = 5.0  # s
     closed: float = 0.02  # of the throttle: below is noise
@@ -331,7 +331,7 @@ def directions(runs: Sequence[Recording]) -> list[int]:
 
 
 class RoadLoad:
-    """What holds a coasting vehicle back, by the effects of its own model."""
+    """Forces on a coasting vehicle, by the effects of its model."""
 
     def __init__(self, vehicle: Vehicle, values: Mapping[str, float] | None = None, heavier: float = 0.0) -> None:
         """values: in place of the vehicle's own. heavier [kg]: than the run says."""
@@ -509,8 +509,8 @@ class RoadFitter:
     def covariance(self, road: RoadFit, about: RoadFit) -> Array:
         """The covariance of `NAMES`, with that of what else is not known well.
 
-        Mass, inertia, radius, the motor's own drag and air density are taken as given in the fit. What they shift, were
-        they one sd off, is added: -(X'X)⁻¹·X'·D, with D the derivative of the deceleration by them, about `about`.
+        Mass, inertia, radius, the motor's own drag and air density are taken as given in the fit. The shift by one
+        sd of each is added: -(X'X)⁻¹·X'·D, with D the derivative of the deceleration by them, about `about`.
         """
         p, value, solution = self.vehicle.parameters, about.value, road.solution
         base = {name: value[name] for name in NAMES}
@@ -559,7 +559,7 @@ def _fitted(fit: RoadFitter, result: Result) -> tuple[RoadFit, Array]:
     tie = covariance[:, 1] / covariance[1, 1]
     # About the value that is held, not about the most likely one: its distance counts as an error too.
     covariance = covariance + np.outer(tie, tie) * speed_term**2
-    why = "zero (less than 2 sd)" if drag > 0 else f"drag, whose area would be {drag:.2f} m² beside it"
+    why = "zero (less than 2 sd)" if drag > 0 else f"drag, whose area would be {drag:.2f} m² then"
     result.refusals.append(
         f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m is indistinguishable from "
         f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"

@@ -86,7 +86,7 @@ class CoolingRun:
 def bench_run(table: Measurements, vehicle: Vehicle, airflow: float | str = "none") -> CoolingRun:
     """Read a run of motor and inverter with measured losses, in a closed room unless `airflow` says otherwise.
 
-    InputError naming what is missing.
+    InputError naming a missing column.
     """
     time = table["time"]
     grid = _grid(time, table.file.name)
@@ -415,7 +415,7 @@ def _starts(vehicle: Vehicle, names: Sequence[str]) -> dict[str, float]:
 
 
 def _priors(vehicle: Vehicle, names: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Wide priors, three standard deviations: they only stop what the data do not bound."""
+    """Wide priors, three standard deviations: they only bound values that the data leave free."""
     known = vehicle.parameters.known
     return {name: (known[name].value, 3 * max(known[name].sd, 0.3 * known[name].value)) for name in names}
 

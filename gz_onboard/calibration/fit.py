@@ -1,4 +1,4 @@
-"""Least squares with covariance, held-out data, and what the data cannot tell apart.
+"""Least squares with covariance, held-out data, and errors for parameters that the data cannot separate.
 
 Two fits, `linear` and `nonlinear`, give a `Solution`. Its covariance is that of independent residuals; for samples
 that depend on each other (one run, one ride) give `groups`: then it is the sandwich of Liang & Zeger (1986), which
@@ -56,7 +56,7 @@ class Solution:
 
 
 def correlation(covariance: Array) -> Array:
-    """The correlation of a covariance, exactly symmetric; nothing is correlated with what has no spread."""
+    """The correlation of a covariance, exactly symmetric; a value without spread is not correlated."""
     sd = np.sqrt(np.diag(covariance))
     scale = np.where(sd > 0, sd, np.inf)
     matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
@@ -114,7 +114,7 @@ def nonlinear(
     """The parameters near `start` for which `residual` (of an array in its order, weighted, shape (m,)) is least.
 
     known_sd: the residual is in units of its true sd, so that its size is not scaled to 1 (a size above 1 still is:
-    what the model cannot follow makes parameters less sure); a prior needs it. The rest as for `linear`.
+    a poor model makes parameters less sure); a prior needs it. The rest as for `linear`.
     """
     names = tuple(start)
     x0 = np.array([start[name] for name in names], dtype=float)

@@ -1,8 +1,8 @@
 """Motor and inverter from steady points of a dynamometer (Lord 2016, eqs. 2.7, 2.8, sec. 2.3, figs. 2.12 to 2.15).
 
 Back-EMF over speed, torque over current, and losses in watts: an efficiency has no value at no torque, where a scooter
-in traffic spends its time. The shaft gives what the air gap does less the drag of iron
-and bearings, so that shaft torque is no line through zero:
+in traffic spends its time. The shaft's torque is that of the air gap less the drag of
+iron and bearings, so that shaft torque is no line through zero:
 
     torque = torque_constant·i_m − motor_iron_linear·sign(ω) − motor_iron_quadratic·ω
 
@@ -167,7 +167,7 @@ def _check_loss(dyno: Measurements, loss: Array, below: str, machine: str) -> No
 def solve(bench: Bench, use: Mask) -> Solution:
     """`TIED` of the points `use`, together.
 
-    `FREQUENCY` is held at 0 where it is not distinguishable from it; its sd is what it would have free.
+    `FREQUENCY` is held at 0 where it is not distinguishable from it; its sd is that of a free fit.
     """
     free, plain = _solve(bench, use, True), _solve(bench, use, False)
     resistance, product = free["motor_copper_resistance"], free[FREQUENCY]
@@ -248,7 +248,7 @@ def _fall_with_current(bench: Bench, found: Solution, model: Array, result: Resu
         return 0.0
     result.notes.append(
         f"torque over current falls with current: {small:.4f} N·m/A at small, {small + fall * largest**2:.4f} at "
-        f"{largest:.0f} A; {constant:.4f} stands for up to {bench.limit:.0f} A"
+        f"{largest:.0f} A; {constant:.4f} is used up to {bench.limit:.0f} A"
     )
     return float(np.std(small + fall * i[bench.use] ** 2))
 

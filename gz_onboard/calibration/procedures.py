@@ -43,7 +43,7 @@ class Slot:
 
 @dataclass
 class Given:
-    """The data of one step, read, and what is known by then."""
+    """The data of one step, read, and the results before it."""
 
     vehicle: Vehicle  # with the results of earlier steps
     earlier: list[Result]
@@ -60,7 +60,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Procedure:
-    """What a procedure does, the files it takes by slot, how it is run, and its options with their defaults."""
+    """A procedure: its purpose, the files it takes by slot, how it is run, and its options with their defaults."""
 
     what: str
     slots: Mapping[str, Slot]
@@ -106,7 +106,7 @@ def _open_circuit(given: Given) -> tuple[Curve, Found]:
 
 
 def _true(given: Given, data: str) -> list[Recording]:
-    """The rides without what the vehicle's sensors are known to err by."""
+    """The rides, corrected for known errors of the vehicle's sensors."""
     parameters = given.vehicle.parameters
     return [replace(ride, columns=true_columns(ride.columns, parameters)) for ride in given.rides.get(data, [])]
 
@@ -193,7 +193,7 @@ PROCEDURES: dict[str, Procedure] = {
         lambda given: sensors.offsets(given.rides["data"], given.vehicle),
     ),
     "resistance": Procedure(
-        "resistance of pack and cable beside the cells",
+        "resistance of cable and of pack outside the cells",
         {
             "data": Slot("ride", "rides, above 20 degC for the pack", 1),
             "pulses": Slot("table", "pulse tests of a cell, at two temperatures or more", 0),

@@ -1,6 +1,6 @@
 """R0, R1 and C1 over state of charge and temperature from pulse tests of one cell (Lord 2016, sec. 2.2).
 
-One table per temperature. Each test begins at full and rests before its pulses; what it rests at shows how much charge
+One table per temperature. Each test begins at full and rests before its pulses; its rest voltages show how much charge
 there is between full and empty at its temperature. Many RC pairs of fixed time constants are fitted, linear in every
 table (see `circuit`). Of these the slow ones become an effect, and the one pair that is nearest to the rest under a
 load like riding the tables.
@@ -60,7 +60,7 @@ MIDDLE = (SOC > 0.15) & (SOC < 0.95)  # nodes whose tables change little with th
 
 @dataclass(frozen=True)
 class PulseConfig:
-    """What a pulse test must be like, and from when on what it shows is believed."""
+    """Requirements of a pulse test, and limits from which on its results are believed."""
 
     fewest_pulses: int = 6
     fewest_levels: int = 3  # states of charge with a long rest
@@ -303,7 +303,7 @@ def _ocv_and_slope(nodes: Array, volts: Array, level: Array) -> tuple[Array, Arr
 def _charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, names: str, result: Result) -> Reaction:
     """The effect `charge_transfer`, if pulses of several currents show it: resistance that falls with the current.
 
-    Of the circuit only this is not linear in what is to be found. So its three numbers are searched for, and at each
+    Only this part of the circuit is not linear in its parameters. So its three numbers are searched for, and at each
     trial all tables are solved for at once (variable projection: Golub & Pereyra 1973).
     """
     first = [fit_branches(x).resistance for x in _moved_pieces(tests, nodes, volts)]
@@ -357,7 +357,7 @@ def _without(reaction: Reaction, tested: Tested) -> Tested:
 
 
 def _cost_of(tested: Tested, nodes: Array, volts: Array, resistance: Array) -> Callable[[Reaction], float]:
-    """The sum of squares that the best tables leave of a test beside a reaction, with the priors' share.
+    """The sum of squares that the best tables leave of a test with a reaction, priors included.
 
     `resistance` (1 + len(TIMES), n) [ohm], as fitted without charge transfer: the size that the priors refer to.
     """
@@ -444,7 +444,7 @@ def _tables(result: Result, axes: dict[str, Array], covered: Mask, how: str, cel
 def _mesh_quality(result: Result, tests: Sequence[Tested], split: Sequence[Pieces], one: Reduction, names: str) -> None:
     """R² of the meshes that half the pulse groups make, against those of the other half.
 
-    A group is what lies between two long rests.
+    A group lies between two long rests.
     """
     halves, covered = [], np.tile((SOC > 0.19) & (SOC < 0.91), (len(tests), 1))
     for half in (0, 1):
@@ -519,8 +519,8 @@ def _slow_relaxation(
     """(resistance [ohm], time [s]) of the effect `slow_relaxation`; None, with a note, if the pairs do not show it.
 
     What relaxes over tens of minutes: diffusion in the particles. It changes little with temperature and, away from
-    full and empty, with the state of charge, so one number each stands for its tables: the median, as the resistance
-    grows steeply where the open-circuit voltage is steep; the fast pair takes what it leaves.
+    full and empty, with the state of charge, so that one number replaces each table: the median, as the resistance
+    grows steeply where the open-circuit voltage is steep; the fast pair takes the rest.
     """
     slow, logs, c = 1 + np.flatnonzero(PULSE.slow_time < TIMES), np.log(TIMES), PULSE
     tables, times, doubts = [], [], []
@@ -597,7 +597,7 @@ def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) ->
 
     Of the residual over time, not over samples, most of which are in the pulses. Rest and load count the same: a test
     rests nine tenths of its time, a ride does not, and under a load that stays the circuit errs several times as much.
-    Beside them ``voltage_error_time`` over temperature, which no vehicle file gets from here.
+    Also ``voltage_error_time`` over temperature, which no vehicle file gets from here.
     """
     c, rows = PULSE, []
     for r in residuals:

@@ -31,7 +31,7 @@ _MOST_TIED = 12  # parameters: a table of more correlations is not read
 KEYS = {
     "vehicle": "vehicle file that the calibration started from",
     "out": "vehicle file written, or null",
-    "thesis": "what the thesis gives beside what was found here",
+    "thesis": "results of the thesis and of this calibration",
     "procedures": "one for each procedure:",
     "  procedure": "its name",
     "  parameters": "by name: value, sd, unit, source",
@@ -72,10 +72,10 @@ def _correlations(result: Result) -> list[tuple[tuple[str, ...], Array]]:
 
 
 class ThesisResult(NamedTuple):
-    """One of the thesis' results: what it reached, and which of our fits answers it.
+    """One of the thesis' results, and which of our fits answers it.
 
-    fits: (procedure, beginning of `Fit.what`, part of `Fit.data`, held out). limit: the greatest error in `unit`; of R²
-    where there is no unit, which is to be reached.
+    fits: (procedure, beginning of `Fit.what`, part of `Fit.data`, held out). limit: the greatest error in `unit`; the
+    least R² where there is no unit.
     """
 
     what: str
@@ -109,7 +109,7 @@ THESIS_HEAD = ("what", "thesis", "ours", "rms", "on", "better")
 
 
 def compare_thesis(results: Sequence[Result]) -> list[tuple[str, ...]]:
-    """Rows of `THESIS_HEAD` for what was calibrated; the worst of several fits that answer one row."""
+    """Rows of `THESIS_HEAD` for the calibrated procedures; the worst of several fits that answer one row."""
     rows = []
     for one in THESIS:
         procedure, what, data, held_out = one.fits
@@ -158,7 +158,7 @@ def text(result: Result) -> str:
 
 
 def shape(curve: Curve) -> str:
-    """What a table is over and where it lies."""
+    """The axes and range of a table."""
     over = " and ".join(f"{len(values)} of {axis}" for axis, values in curve.axes.items())
     return f"{curve.value.min():.4g} to {curve.value.max():.4g} {curve.unit} over {over}"
 

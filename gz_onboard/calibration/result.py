@@ -1,4 +1,4 @@
-"""What a calibration procedure gives: values with their uncertainty, what the data do not show, how well it fits."""
+"""Result of a calibration procedure: values with their uncertainty, refusals, quality of fit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gz_onboard.errors import InputError, brief
 
 
 class LackingError(InputError):
-    """No ride has the sensors that a procedure needs; the others of a calibration go on."""
+    """No ride has the sensors that a procedure needs; the other procedures continue."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Panel:
 def compared(
     title: str, x_label: str, y_label: str, x: Array, data: Array, model: Array, style: str = "-"
 ) -> list[Panel]:
-    """Data and model over `x`, in the unit at the end of `y_label`, and what the model leaves over."""
+    """Data and model over `x`, in the unit at the end of `y_label`, and the residual."""
     unit = y_label.rpartition("[")[2]
     order = np.argsort(x) if style == "-" else slice(None)
     lines = PlotLine("measured", x, data, "."), PlotLine("model", x[order], model[order], style)
@@ -92,7 +92,7 @@ class Result:
 
     effects: by name, whether the data show it, where a procedure looked for it: the model then has it, or has it not.
     covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
-    refusals: what the data could not show, one sentence each, with the number that says so.
+    refusals: parameters that the data could not show, one sentence each, with the number that says so.
     """
 
     procedure: str

@@ -1,4 +1,4 @@
-"""Wheel radius, auxiliary power, errors of the pack's sensors and resistances beside the cells, out of rides.
+"""Wheel radius, auxiliary power, errors of the pack's sensors and resistances outside the cells, out of rides.
 
 Two sensors show where they differ, not which one errs: without a third the gain found is that of the pack against the
 inverter's, and its sd is that of a sensor's class. Absolute numbers are of a vehicle of size 1 (see `sizes_of`).
@@ -26,7 +26,7 @@ from gz_onboard.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class RideConfig:
-    """Which samples of a ride count, and what a sensor's class adds to the scatter."""
+    """Which samples of a ride count, and standard deviations of sensors by their class."""
 
     # wheel radius
     slowest: float = 5.0  # m/s: below, a receiver's speed is poor
@@ -307,7 +307,7 @@ def offsets(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
 def _offset(result: Result, resting: Sequence[PackReadings], vehicle: Vehicle, paired: bool) -> None:
     """pack_current_offset of rides at rest. The sd is that of a ride to come.
 
-    Beside the scatter from ride to ride, the inverter's own loss and the auxiliary sensor's class are in it.
+    Besides the scatter from ride to ride, the inverter's own loss and the auxiliary sensor's class are in it.
     """
     if not resting:
         result.refusals.append(
@@ -360,7 +360,7 @@ def _labels(columns: Sequence[Array]) -> Array:
     return np.repeat(np.arange(len(columns)), [len(column) for column in columns])
 
 
-# --- resistances beside the cells ----------------------------------------------------------------------------------
+# --- resistances outside the cells ---------------------------------------------------------------------------------
 
 
 def resistances(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
@@ -415,11 +415,11 @@ def cable_resistance(rides: Sequence[Recording], vehicle: Vehicle) -> Result:
 
 
 def pack_series_resistance(rides: Sequence[Recording], vehicle: Vehicle, pulses: Sequence[Measurements]) -> Result:
-    """pack_series_resistance [ohm]: 0.2 s steps of warm rides less what the cells alone give in that time.
+    """pack_series_resistance [ohm]: 0.2 s steps of warm rides less those of the cells alone.
 
     pulses: pulse tests of a cell at two temperatures or more, with `time`, `current`, `voltage` and `cell_temperature`:
     their steps of the same length are the cells' part. Raises InputError if there are too few large steps. Gives a
-    refusal instead of a number where the cells' own doubt is greater than what is left.
+    refusal instead of a number where the cells' own doubt is greater than the rest.
     """
     c, result, name = RIDE, Result("resistance"), "pack_series_resistance"
     by_temperature, min_step = cell_steps(pulses), c.min_step * sizes_of(vehicle).current

@@ -3,7 +3,7 @@
 A step comes from a command line (`step_of`) or from a manifest ``calibration.toml``:
 
     schema = 1
-    vehicle = "scooter.toml"               # what is known without measuring; or one of the package's own
+    vehicle = "scooter.toml"               # known without measuring; or one of the package's own
 
     [ocv]
     data = ["cell_ocv_25C.csv.gz"]
@@ -229,9 +229,8 @@ def _files(table: Table, slot: str) -> tuple[Path, ...]:
 def run_steps(steps: Sequence[Step], base: Path, begin: Callable[[str], None] = lambda _: None) -> Iterator[Result]:
     """Run the `steps`, each with the results of those before it put into the vehicle file `base`.
 
-    begin: is called with the name of each part of the work. Raises
-    InputError for data that cannot be used, naming the procedure; one of several steps whose sensors no ride has is
-    refused, and the others go on.
+    begin: is called with the name of each part of the work. Raises InputError for data that cannot be used, naming the
+    procedure; one of several steps whose sensors no ride has is refused, and the others continue.
     """
     read: dict[Path, Recording] = {}
     results: list[Result] = []

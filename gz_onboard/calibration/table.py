@@ -2,12 +2,12 @@
 
     time_s,current_A,voltage_mV,cell_temperature_degC
 
-A column is called quantity_unit; ``quantity[unit]`` and ``quantity (unit)`` are read too. What comes out is by
+A column is called quantity_unit; ``quantity[unit]`` and ``quantity (unit)`` are read too. Columns come out by
 quantity, in SI units and degC. For tables of other people a mapping says which column is what:
 
     columns = { time = "t_s", voltage = "v_V", current = { column = "i_A", scale = -1 } }
 
-What a table has no column for, but is the same in all of it, is stated: ``cell_temperature = { value = 25, unit =
+A quantity that is the same in all rows needs no column: ``cell_temperature = { value = 25, unit =
 "degC" }``.
 """
 
@@ -89,8 +89,8 @@ class Measurements:
     """Columns of measurements.
 
     columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
-    never decreases; two rows at one time are the two sides of a step. lines: where each row stands in the file, from 1
-    (for Parquet: its row). trouble: by quantity, why a column of the file cannot be used; raised when it is asked for.
+    never decreases; two rows at one time are the two sides of a step. lines: line of each row in the file, from 1 (for
+    Parquet: its row). trouble: by quantity, why a column of the file cannot be used; raised when it is asked for.
     """
 
     file: Path
@@ -117,7 +117,7 @@ class Measurements:
         raise InputError(f"{self.file}: no column for {name!r}{wanted}{nearest(name, known)}; there are {columns}")
 
     def line(self, row: int) -> int:
-        """Where row `row` stands in the file."""
+        """The line of row `row` in the file."""
         return int(self.lines[row]) if len(self.lines) else row + 1
 
     def error(self, message: str, row: int | None = None) -> InputError:
@@ -128,9 +128,9 @@ class Measurements:
 def read_table(file: Path, columns: Mapping[str, Named] | None = None) -> Measurements:
     """The table in `file`.
 
-    columns: for a file with names of its own, the column of each quantity; all others are left out. Raises InputError
-    naming file, line, column and value for a file that cannot be read, for a missing column or unit, for what is not a
-    finite number, and for a time that goes back.
+    columns: for a file with other names, the column of each quantity; all others are left out. Raises InputError
+    naming file, line, column and value for a file that cannot be read, for a missing column or unit, for a value that
+    is no finite number, and for a time that goes back.
     """
     names, raw, lines = _read_parquet(file) if file.suffix in (".parquet", ".pq") else _read_csv(file)
     found: dict[str, Array] = {}
@@ -214,7 +214,7 @@ def _kinds(quantity: str) -> tuple[str, ...]:
 
 
 def _converted(quantity: str, named: Named, values: Sequence[object], lines: Sequence[int], file: Path) -> Array:
-    """The column of a quantity in SI units. InputError for no unit, a wrong one, or what is no finite number."""
+    """The column of a quantity in SI units. InputError for no or a wrong unit, and values that are not finite."""
     place, written = f"{file}: column {named.column!r}", named.unit
     if written is None:
         written = _split(named.column)[1]
