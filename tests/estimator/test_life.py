@@ -427,3 +427,14 @@ def test_a_speed_of_zero_with_the_current_of_a_drive_is_no_standing():
     rows = follow(e, dead, scooter)
     assert all(row.activity is Activity.UNKNOWN for _, row in rows[15:40])
     assert not e._activity.teaches
+
+
+def test_a_doubted_current_is_still_compared_with_the_sag_of_the_voltage():
+    """It is believed again once it explains the voltage; the current of the model, used meanwhile, proves nothing."""
+    scooter, e = Scooter(soc=0.9), estimator()
+    events = [event for event in scooter.live(400, 15.0) if event[1] != INVERTER]
+    tripled = ((t, g, (v[0], 3 * v[1], v[2]) if g == PACK and t > 120 else v) for t, g, v in events)
+    _, end = follow(e, tripled, scooter)[-1]
+    assert "pack_current" in end.distrusted
+    assert end.current_modelled
+    assert e.electrical.sag.ratio == pytest.approx(1 / 3, rel=0.3)
