@@ -15,14 +15,14 @@ import cantools
 from cantools.database.can import Message
 
 from gz_onboard.calibration import report
+from gz_onboard.calibration.cooling import AIRFLOWS
 from gz_onboard.calibration.procedures import PROCEDURES
-from gz_onboard.calibration.steps import number_options
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.discovery.judgement import VERSION as DISCOVER_VERSION
 from gz_onboard.discovery.judgement import Report
 from gz_onboard.estimation.summary import KEYS, SUMMARY_VERSION
 from gz_onboard.model.effect import QUANTITIES, VEHICLE_PARAMETERS, Parameter, package_effects
-from gz_onboard.model.parameters import BATTERY_PARAMETERS
+from gz_onboard.model.parameters import BATTERY_PARAMETERS, SIMULATION_PARAMETERS
 from gz_onboard.reports.results import descriptions
 from gz_onboard.simulation import summary as simulated
 from gz_onboard.validation import command as validation
@@ -54,7 +54,8 @@ def commands() -> Iterator[str]:
         for slot, data in procedure.slots.items():
             key = "`DATA`" if slot == "data" else f"`--with {slot}=FILE`"
             yield f"  - {key}: {data.what}{'' if data.min_files else ' (optional)'}"
-        yield from (f"  - `--set {option}={value}`" for option, value in number_options(name).items())
+        for option, value in procedure.options.items():
+            yield f"  - `--set {option}={value or '|'.join((*AIRFLOWS, 'M/S'))}`"
     yield "\n## Keys of JSON results"
     for of, version, keys in RESULTS:
         yield f"\n### {of}\n\nVersion {version}.\n"
@@ -68,6 +69,8 @@ def vehicle() -> Iterator[str]:
     yield from parameters(VEHICLE_PARAMETERS)
     yield "\n## Battery\n"
     yield from parameters(BATTERY_PARAMETERS)
+    yield "\n## Simulation\n"
+    yield from parameters(SIMULATION_PARAMETERS)
     for name, module in package_effects().items():
         yield f"\n## {name}\n\n{(module.__doc__ or '').strip()}\n"
         yield from parameters(module.PARAMETERS)

@@ -86,11 +86,6 @@ def files_of(steps: Sequence[Step], data: Sequence[Path]) -> list[Path]:
     return [*read, *data, *(folder / MANIFEST for folder in data)]
 
 
-def number_options(name: str) -> dict[str, float]:
-    """The options of the procedure `name` that are numbers, with their defaults."""
-    return {option: value for option, value in PROCEDURES[name].options.items() if isinstance(value, float)}
-
-
 def _checked(option: str, value: object, error: Callable[[str], InputError]) -> float | str:
     """The `value` of an option, a number or one of `AIRFLOWS`. error: makes the error to raise."""
     if option == AIRFLOW and isinstance(value, str) and value in AIRFLOWS:
