@@ -46,8 +46,8 @@ class BaselineConfig:
     weight: float = 1.0  # rides that the scatter before any healthy ride is worth
     weather_weight: float = 4.0  # the same of the wind: a few calm days do not promise more of them
     least_inflation: float = 0.6
-    hardly: float = 0.8  # of the sd before: a guess that is no surer was not measured
-    apart: float = 12.0  # times the usual scatter: of eight healthy rides 5 at most, with a current 30 % wrong 61
+    unmeasured: float = 0.8  # of the sd before: a guess that is no surer was not measured
+    outlying: float = 12.0  # times the usual scatter: of eight healthy rides 5 at most, with a current 30 % wrong 61
     least_checked: int = 5  # rides, to hold two out at a time
 
 
@@ -82,8 +82,8 @@ def baseline(
     for rides that cannot be used, that contradict the file, or that predict each other's energy worse than it does.
     """
     roads = [r for r in healthy if "roller_speed" not in r.columns and r.facts.get("kind") != "coastdown"]
-    left = [ride.name for ride in healthy if all(ride is not road for road in roads)]
-    notes = [f"left out, as no rides on a road: {', '.join(left)}"] if left else []
+    others = [ride.name for ride in healthy if all(ride is not road for road in roads)]
+    notes = [f"left out, as no rides on a road: {', '.join(others)}"] if others else []
     if len(roads) < LEAST_RIDES:
         raise InputError(
             "; ".join([f"{len(roads)} healthy rides: three are the least that tell how they differ", *notes])
@@ -107,7 +107,7 @@ def adopted(vehicle: Vehicle, mixed: MixedModel, before: MixedModel) -> Vehicle:
         if name not in known or (name not in model and known[name].source.startswith("prior:")):
             continue
         old = known[name]
-        if old.status == "guess" and s > BASELINE.hardly * float(np.sqrt(before.prior[i, i]) * before.scale[i]):
+        if old.status == "guess" and s > BASELINE.unmeasured * float(np.sqrt(before.prior[i, i]) * before.scale[i]):
             continue
         wide = float(s * (old.value if name in LOG_SCALED else 1.0))
         value = float(np.clip(at[name], declared[name].low, declared[name].high))
@@ -139,7 +139,7 @@ def learn(
     lines = linearise_all(rides, now, workers)
     weather = {name for cause in mixed.causes if cause.varies for name in cause.names}
     weight = np.where(np.isin(mixed.names, list(weather)), BASELINE.weather_weight, BASELINE.weight)
-    post = now.learned_scatter(lines, weight, BASELINE.scatter_rounds)
+    post = now.fit(lines, weight, now.free, BASELINE.scatter_rounds)
     before = replace(now, scatter=post.scatter, healthy=len(rides))
     after = replace(before, mean=post.mean, prior=post.covariance)
     folds = []
@@ -239,7 +239,7 @@ def rides_apart(learned: Learned) -> list[str]:
     found = []
     for line, row in zip(learned.lines, own, strict=True):
         i = max(judged, key=lambda i: abs(row[i] / sd[i]))
-        if (far := abs(row[i] / sd[i])) > BASELINE.apart:
+        if (far := abs(row[i] / sd[i])) > BASELINE.outlying:
             found.append(
                 f"{line.ride.name} is an outlier: {before.names[i]} is {far:.0f} times as far from the others as rides "
                 "usually are; is it healthy, and are its signals right?"

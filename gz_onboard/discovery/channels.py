@@ -28,9 +28,9 @@ def always(ride: Ride) -> Mask:
     return np.ones(len(ride.time), dtype=bool)
 
 
-def rolling(ride: Ride, least: float = ROLLING) -> Mask:
-    """Faster than `least` [m/s], without a brake."""
-    return np.asarray((np.abs(ride.quantities["speed"]) > least) & ~ride.braking)
+def rolling(ride: Ride, threshold: float = ROLLING) -> Mask:
+    """Faster than `threshold` [m/s], without a brake."""
+    return np.asarray((np.abs(ride.quantities["speed"]) > threshold) & ~ride.braking)
 
 
 def coasting(ride: Ride) -> Mask:
@@ -91,7 +91,7 @@ class Channel:
     shaken: float = 0.0  # m/s² of vibration that do
     fast: float = 0.0  # m/s that do, in a power: force noise times speed
     fed_by: tuple[str, ...] = ()  # roles that it needs too, though not at each instant
-    apart: float = math.inf  # s between samples of its roles, beyond which they do not show it
+    max_gap: float = math.inf  # s between samples of its roles, beyond which they do not show it
     unless: tuple[str, ...] = ()  # channels that together show it in parts, where the motor current was measured
 
     def depends(self, effects: Sequence[Effect]) -> set[str]:
@@ -101,7 +101,7 @@ class Channel:
 
     def too_slow(self, ride: Ride) -> bool:
         """Whether samples of its roles are too far apart."""
-        return any(ride.periods.get(role, 0.0) > self.apart for role in self.roles)
+        return any(ride.periods.get(role, 0.0) > self.max_gap for role in self.roles)
 
     def usable(self, ride: Ride, system: System) -> bool:
         """Whether the ride has the signals that it needs."""
@@ -295,7 +295,7 @@ CHANNELS = (
         battery=True,
         correlated=False,
         rough=3.0,
-        apart=0.15,
+        max_gap=0.15,
     ),
     Channel(
         "gps_speed",

@@ -606,7 +606,7 @@ def needs(mixed: MixedModel, cause: Candidate) -> tuple[str, ...]:
     """The roles that show `cause`, a text for each set of them, the shortest first."""
     sets = {
         " and ".join((*channel.roles, *channel.fed_by))
-        + (f" each {channel.apart:g} s or more often" if channel.apart < math.inf else "")
+        + (f" each {channel.max_gap:g} s or more often" if channel.max_gap < math.inf else "")
         for channel in showing(mixed, cause)
     }
     return tuple(sorted(sets, key=lambda text: (text.count(" and "), text)))
@@ -634,17 +634,17 @@ def limits(now: Search, order: Sequence[str]) -> dict[str, Limit]:
 
 
 def measure_gain(
-    now: Search, causes: Sequence[FoundCause], unknown: Unknown | None, seed: int, apart: Sequence[LinearRide]
+    now: Search, causes: Sequence[FoundCause], unknown: Unknown | None, seed: int, holdout: Sequence[LinearRide]
 ) -> Gain:
     """Errors of rides that were not fitted, with the `causes` and the curve of `unknown` and without.
 
-    seed: of the bootstrap over rides. apart: rides that had no part in the search. Without any, each of its rides is
+    seed: of the bootstrap over rides. holdout: rides that had no part in the search. Without any, each of its rides is
     held out in turn; the choice of the causes is then shared.
     """
-    mixed, lines, known = now.mixed, [*now.lines, *apart], len(now.lines)
+    mixed, lines, known = now.mixed, [*now.lines, *holdout], len(now.lines)
     if len(lines) < 2:
         return Gain(note="one ride: nothing to hold out")
-    folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
+    folds = [list(range(known, len(lines)))] if holdout else [[i] for i in range(known)]
     named = {cause.name for cause in causes if not cause.varies}
     after = [cause for cause in mixed.causes if cause.name in named]
     form = None
@@ -657,7 +657,9 @@ def measure_gain(
             rows.setdefault(metric, []).append([found[metric] for found in each])
     rng = np.random.default_rng(seed)
     held = tuple(lines[i].ride.name for fold in folds for i in fold)
-    return Gain(held, None, bool(apart), **{metric: summarised(np.array(table), rng) for metric, table in rows.items()})
+    return Gain(
+        held, None, bool(holdout), **{metric: summarised(np.array(table), rng) for metric, table in rows.items()}
+    )
 
 
 def summarised(table: Array, rng: np.random.Generator) -> Errors:
@@ -684,11 +686,11 @@ def remaining_error(gain: Gain, lines: Sequence[LinearRide]) -> tuple[str, float
 
 
 def judge(
-    problem: Search, now: Search, notes: Sequence[str] = (), seed: int = 0, apart: Sequence[LinearRide] = ()
+    problem: Search, now: Search, notes: Sequence[str] = (), seed: int = 0, holdout: Sequence[LinearRide] = ()
 ) -> Discovery:
     """The report on `now`, the accepted causes of `problem`.
 
-    notes: so far. seed: of the bootstrap. apart: rides, linearised where `now` is, that only the gain is measured on.
+    notes: so far. seed: of the bootstrap. holdout: rides, linearised where `now` is, that only the gain is measured on.
     """
     constancy = splits(now)
     unknown = unexplained(now, constancy)
@@ -707,16 +709,16 @@ def judge(
             (wind,) = causes_of(every, [*chosen, name])[-1:]
             found.append(replace(wind, evidence=round(now.winds.score, 2), varies=True))
             notes.append("the wind differed from ride to ride: " + now.winds.words)
-    gain = measure_gain(now, found, unknown, seed, apart)
+    gain = measure_gain(now, found, unknown, seed, holdout)
     if unknown is not None and found and not unknown.denies:
-        plain = measure_gain(now, found, None, seed, apart)
+        plain = measure_gain(now, found, None, seed, holdout)
         metric = "voltage" if unknown.channel == "cell_voltage" else "power"
         without, with_it = plain.errors.get(metric), gain.errors.get(metric)
         if without is not None and with_it is not None and without.after <= with_it.after:
             notes.append(f"{unknown} does not improve rides held out: left out")
             unknown, gain = None, plain
     implausible = implausible_explanations(now, chosen, scores)
-    what, missed = remaining_error(gain, now.lines)
+    metric, missed = remaining_error(gain, now.lines)
     verdict = "ambiguous" if sets else "cause" if found else "none"
     if not found and (unknown is not None or implausible):
         verdict = "unknown"
@@ -724,7 +726,7 @@ def judge(
         verdict = "inconclusive"
     if missed > JUDGE.missed:
         limit = f"(healthy rides: up to {JUDGE.healthy_most:.0%})"
-        notes.append(f"{missed:.0%} of the {what} is missed on rides held out {limit}")
+        notes.append(f"{missed:.0%} of the {metric} is missed on rides held out {limit}")
     ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
     report = Report(
         verdict=verdict,
@@ -822,7 +824,7 @@ def missing_residuals(now: Search) -> list[str]:
     for channel in channels:
         if any(set(channel.roles) <= ride.have and channel.too_slow(ride) for ride in rides):
             sentences.append(
-                f"samples of {' and '.join(channel.roles)} are further apart than {channel.apart:g} s: no "
+                f"samples of {' and '.join(channel.roles)} are further apart than {channel.max_gap:g} s: no "
                 f"{readable(channel.name)} there"
             )
     if any("pack_power" in line.tables for line in now.lines):

@@ -390,12 +390,6 @@ class MixedModel(Population):
         """The places of the parameters of `causes`."""
         return self.index(name for cause in causes for name in cause.names)
 
-    def learned_scatter(
-        self, rides: Iterable[LinearRide | Statistics], weight: Array | float, rounds: int
-    ) -> Posterior:
-        """The fit with the scatter that `rides` show; see `fit`."""
-        return self.fit(rides, weight, self.free, rounds)
-
     def freed(self, index: Sequence[int]) -> MixedModel:
         """With nothing known of the common part at `index`."""
         prior = self.prior.copy()
@@ -599,7 +593,7 @@ def without_baseline(mixed: MixedModel, lines: Sequence[LinearRide]) -> MixedMod
         lines = [line.at_noise(wide.noise) for line in lines]
     scatter = mixed.scatter
     if len(lines) > 2:
-        scatter = wide.learned_scatter(lines, 1.0, 60).scatter
+        scatter = wide.fit(lines, 1.0, wide.free, 60).scatter
     noise = dict(wide.noise)
     if "cell_voltage_error" in mixed.vehicle.parameters:  # the circuit errs as the file says, and slowly
         white, slow, time = noise["cell_voltage"]

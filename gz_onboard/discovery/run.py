@@ -41,13 +41,13 @@ def discover(
     """
     known_rides(holdout, [ride.name for ride in rides])
     mixed = restore(vehicle, folder)
-    found, left = read_all(mixed, rides)
-    notes = [*notes, *left]
-    apart = [ride for ride in found if ride.name in holdout]
-    found = [ride for ride in found if ride.name not in holdout]
-    for rides_left, use in ((found, "fitted"), (apart, "held out")):
-        if not rides_left and (holdout or use == "fitted"):
-            raise InputError(f"no ride that was to be {use} can be used: {'; '.join(left)}")
+    usable, unusable = read_all(mixed, rides)
+    notes = [*notes, *unusable]
+    held_out = [ride for ride in usable if ride.name in holdout]
+    found = [ride for ride in usable if ride.name not in holdout]
+    for some, use in ((found, "fitted"), (held_out, "held out")):
+        if not some and (holdout or use == "fitted"):
+            raise InputError(f"no ride that was to be {use} can be used: {'; '.join(unusable)}")
     progress(f"{len(found)} rides, {len(mixed.names)} parameters")
     if not mixed.healthy:
         notes.append(
@@ -63,9 +63,9 @@ def discover(
     problem = search_problem(mixed, lines, offset, workers)
     progress(f"{len(problem.causes)} candidates")
     now = search_causes(problem)
-    held = linearised_about(apart, now.mixed, now.offset, workers) if apart else []
+    held_out_lines = linearised_about(held_out, now.mixed, now.offset, workers) if held_out else []
     progress("curves over quantities, and gain on rides held out")
-    return judge(problem, now, notes, seed, held)
+    return judge(problem, now, notes, seed, held_out_lines)
 
 
 def known_rides(holdout: Sequence[str], names: Sequence[str]) -> None:

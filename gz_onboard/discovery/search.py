@@ -444,7 +444,7 @@ def with_observed_scatter(mixed: MixedModel, lines: Sequence[LinearRide]) -> Mix
     """`mixed` with the scatter between rides that these show, where it is more than that of healthy ones."""
     if len(lines) < 2:
         return mixed
-    found = mixed.widened().learned_scatter(lines, float(mixed.healthy + 1), SEARCH.scatter_rounds).scatter
+    found = mixed.widened().fit(lines, float(mixed.healthy + 1), mixed.free, SEARCH.scatter_rounds).scatter
     return replace(mixed, scatter=np.maximum(found, mixed.scatter))
 
 

@@ -25,7 +25,6 @@ from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.extend import write_model
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.mixed_model import HealthyCurve, LinearChannel, LinearRide, MixedModel, Statistics
-from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.parameters import LOG_SCALED
 from gz_onboard.errors import InputError
 from gz_onboard.vehicle import find_vehicle, read_vehicle
@@ -33,11 +32,6 @@ from tests.discovery.material import cause, cornering, discovered
 
 BLOCKS, RIDES = 40, 6
 REFERENCE = find_vehicle("reference")
-
-
-@pytest.fixture(scope="module")
-def mixed() -> MixedModel:
-    return known_from(read_vehicle("reference"))
 
 
 def at(mixed: MixedModel, name: str, value: float) -> Array:
@@ -108,15 +102,6 @@ def test_a_baseline_that_predicts_rides_worse_than_the_file_is_refused(mixed: Mi
     uneven = [(replace(m, mean=m.mean * (1 + 0.1 * k)), held) for k, (m, held) in enumerate(worse.folds)]
     with pytest.raises(InputError, match=r"Wh/km missed by the file before, .*worse. Nothing is written"):
         check_held_out(replace(worse, folds=uneven))
-
-
-def test_of_many_parameters_the_farthest_are_named_and_the_others_counted(mixed: MixedModel):
-    it = learned(mixed, "altitude", "wheel_radius", mixed.values["wheel_radius"] - 0.03, 0.0)
-    names = ["wheel_radius", "auxiliary_power", "drag_area", "cell_capacity", "rolling_resistance_constant"]
-    mean = it.before.mean + np.isin(mixed.names, names) * 100.0
-    with pytest.raises(InputError, match=r"standard deviations apart.*; and 2 more") as said:
-        check_against_file(replace(it, after=replace(it.after, mean=mean)))
-    assert str(said.value).count("pulls it there") == 3
 
 
 def test_a_ride_whose_sensor_lies_is_named(mixed: MixedModel):

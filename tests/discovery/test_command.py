@@ -42,7 +42,6 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(ROOT / "README.md")], "it ends in '.md'"),
         ([str(RIDE), "--effects", "nowhere"], "--effects nowhere: no such folder"),
         ([str(RIDE), "--vehicle", "refrence"], "did you mean 'reference'"),
-        ([str(RIDE), str(RIDE)], "would both be called city_14C.blf"),
         ([str(RIDE), "--holdout", "city_14C"], "no ride is left to be fitted"),
         ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
         ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),

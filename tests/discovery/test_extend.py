@@ -27,11 +27,6 @@ REFERENCE = find_vehicle("reference")
 
 
 @pytest.fixture(scope="module")
-def mixed() -> MixedModel:
-    return known_from(read_vehicle("reference"))
-
-
-@pytest.fixture(scope="module")
 def lines(mixed: MixedModel) -> list[LinearRide]:
     return linearise_all([mixed.ride(read_recording(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
 

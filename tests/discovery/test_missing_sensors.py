@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from gz_onboard.discovery.channels import CHANNEL, CHANNELS
-from gz_onboard.discovery.grid import with_stand_ins
 from gz_onboard.discovery.judgement import needs
 from gz_onboard.discovery.mixed_model import MixedModel
-from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.residuals import pack_power
 from gz_onboard.discovery.run import discover
 from gz_onboard.errors import InputError
 from gz_onboard.recording.recording import Recording
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle
 from tests.plant.cases import draw_many
 
 INSIDE = {"motor_current", "motor_torque", "inverter_current", "inverter_voltage", "auxiliary_current"}
@@ -26,16 +24,6 @@ INSIDE = {"motor_current", "motor_torque", "inverter_current", "inverter_voltage
 def without(ride: Recording, *roles: str) -> Recording:
     """The ride as a vehicle without these sensors shows it."""
     return replace(ride, columns={n: c for n, c in ride.columns.items() if n not in roles})
-
-
-@pytest.fixture(scope="module")
-def scooter() -> Vehicle:
-    return read_vehicle("reference")
-
-
-@pytest.fixture(scope="module")
-def mixed(scooter: Vehicle) -> MixedModel:
-    return known_from(scooter)
 
 
 @pytest.fixture(scope="module")
@@ -96,15 +84,6 @@ def test_another_speed_and_torque_replace_missing_ones(mixed: MixedModel, loaded
     assert other.quantities["speed"][:n] == pytest.approx(ride.quantities["speed"][:n], abs=0.1)
     rear = mixed.ride(without(plain, "motor_speed", "vehicle_speed"))
     assert "wheel_speed_rear" not in rear.have  # not compared with itself
-
-
-def test_a_replacement_is_as_old_as_its_message_states(scooter: Vehicle, loaded):
-    (message,) = {s.message for s in scooter.mapping.sources if s.role == "gps_speed"}
-    late = replace(scooter, mapping=replace(scooter.mapping, delays={message: 0.9}))
-    plain = without(loaded[0][0], "motor_speed", "wheel_speed_rear", "vehicle_speed")
-    times = plain.columns["gps_speed"][0]
-    for vehicle, delay in ((scooter, 0.4), (late, 0.9)):
-        assert with_stand_ins(plain, vehicle)[0].columns["motor_speed"][0] == pytest.approx(times - delay)
 
 
 def test_a_ride_without_any_measure_of_its_drive_is_refused(mixed: MixedModel, loaded):

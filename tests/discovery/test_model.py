@@ -6,21 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import chi2, f
 
 from gz_onboard.discovery.channels import CHANNEL, ChannelNoise
-from gz_onboard.discovery.curves import (
-    CONSTANT,
-    IN_PROPORTION,
-    KNOTS,
-    columns_of,
-    curve_form,
-    curve_forms,
-    supported_knots,
-)
-from gz_onboard.discovery.grid import GRID, STEP, Ride, grade_by_altitude, since, steering, vibration
+from gz_onboard.discovery.curves import CONSTANT, KNOTS, columns_of, curve_form, curve_forms, supported_knots
+from gz_onboard.discovery.grid import STEP, Ride, grade_by_altitude
 from gz_onboard.discovery.mixed_model import (
     LinearChannel,
     LinearRide,
@@ -40,23 +30,13 @@ from gz_onboard.model.effect import load_effect, package_effects
 from gz_onboard.model.model import standing_load
 from gz_onboard.model.series import all_quantities, total
 from gz_onboard.model.traits import traits
-from gz_onboard.priors import USUAL_SIZES, nearest_step, sizes_of
+from gz_onboard.priors import USUAL_SIZES, sizes_of
 from gz_onboard.recording.recording import Recording, read_recording
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle
 from tests.support import LOGS, cell_voltage
 
 NOISE = ChannelNoise(white=2.0, slow=1.5, time=30.0)
 RIDE = Ride("made up", np.zeros(0), {}, {}, 0.25, None)
-
-
-@pytest.fixture(scope="module")
-def scooter() -> Vehicle:
-    return read_vehicle("reference")
-
-
-@pytest.fixture(scope="module")
-def mixed(scooter: Vehicle) -> MixedModel:
-    return known_from(scooter)
 
 
 @pytest.fixture(scope="module")
@@ -67,31 +47,12 @@ def samples(scooter: Vehicle) -> Recording:
 # --- the grid -------------------------------------------------------------------------------------------------------
 
 
-def test_time_since_an_event_is_a_minute_at_most():
-    happens = np.zeros(1000, dtype=bool)
-    happens[[100, 101, 400]] = True
-    assert since(happens)[[0, 100, 101, 111, 399, 999]] == pytest.approx([60.0, 0, 0, 1.0, 29.8, 59.9])
-
-
-def test_steering_is_that_of_a_bicycle():
-    speed = np.array([3.0, -5.0, 8.0])
-    assert steering(speed, speed**2 / 20.0, 1.3) == pytest.approx(1.3 / 20.0)
-    assert steering(np.array([0.1]), np.array([9.0]), 1.3) == pytest.approx(GRID.most_steering)
-
-
 def test_the_grade_by_altitude_is_that_of_the_hill():
     speed = np.full(4000, 10.0)
     way = np.cumsum(speed) * STEP
     grade = grade_by_altitude(20.0 * np.sin(way / 300.0), speed)
     assert grade[300:-300] == pytest.approx((20.0 / 300.0) * np.cos(way / 300.0)[300:-300], abs=0.003)
     assert not grade_by_altitude(way, np.zeros(4000)).any()
-
-
-def test_vibration_on_the_grid_is_that_of_the_road_there():
-    time, rng = np.arange(0, 60, 0.01), np.random.default_rng(1)
-    shaking = np.where((time > 20) & (time < 40), 3.0, 0.5)
-    found = vibration(time, 9.81 + shaking * rng.normal(size=len(time)), np.arange(0, 60, 0.1))
-    assert np.median(found[260:390]) == pytest.approx(6 * np.median(found[50:190]), rel=0.2)
 
 
 def test_a_message_may_state_how_old_its_values_are(scooter: Vehicle, samples: Recording):
@@ -133,13 +94,6 @@ def test_sensor_errors_of_the_file_are_corrected_in_start_charge_and_heat(scoote
 
 
 # --- parameters -----------------------------------------------------------------------------------------------------
-
-
-@given(st.floats(1e-3, 1e3), st.floats(1.1, 10.0))
-def test_the_nearest_step_is_a_power_and_less_than_half_a_step_away(ratio: float, step: float):
-    power = np.log(nearest_step(ratio, step)) / np.log(step)
-    assert power == pytest.approx(round(power), abs=1e-6)
-    assert abs(np.log(ratio) / np.log(step) - power) <= 0.5 + 1e-6
 
 
 def test_scales_noise_and_knots_grow_with_the_vehicle(scooter: Vehicle):
@@ -273,13 +227,6 @@ def poor(mixed: MixedModel, ride: Recording, **columns: tuple[np.ndarray, np.nda
     known = {role: ride.columns[role] for role in ("pack_voltage", "pack_current", "motor_speed")}
     (line,) = linearise_all([mixed.ride(replace(ride, columns=known | columns))], mixed)
     return line
-
-
-def test_forms_are_curves_and_lines_in_proportion():
-    forms = curve_forms()
-    assert len({form.name for form in forms}) == len(forms)
-    assert {form.quantity for form in forms if form.straight} == set(IN_PROPORTION)
-    assert all(form.basis.shape == (len(form.knots), 1) for form in forms if form.straight)
 
 
 def test_no_curve_over_what_was_not_measured(mixed: MixedModel, samples: Recording):

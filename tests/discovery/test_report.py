@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 
 from gz_onboard.discovery.channels import CHANNEL
 from gz_onboard.discovery.judgement import (
-    JUDGE,
     Discovery,
     Errors,
     Gain,
     Isolability,
-    Report,
     ResidualSize,
     Score,
     errors,
@@ -270,9 +268,3 @@ def test_a_high_score_of_an_impossible_cause_is_implausible(wrong: Discovery):
         assert bool(found) == expected
     (row,) = found
     assert str(row).startswith("pack_current_gain = 3 (") and "current_sensor_gain (score 267) is possible" in str(row)
-
-
-def test_a_report_is_built_once(wrong: Discovery):
-    with pytest.raises(AttributeError):
-        wrong.report.verdict = "none"  # type: ignore[misc]
-    assert JUDGE.missed < JUDGE.healthy_most and isinstance(wrong.report, Report)

@@ -24,12 +24,11 @@ from benchmarks.trial import (
     with_section,
 )
 from benchmarks.trial import summary as counted
-from gz_onboard.discovery import judgement, search
+from gz_onboard.discovery import search
 from gz_onboard.discovery.baseline import baseline
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.judgement import VERDICTS
 from gz_onboard.discovery.mixed_model import LinearRide, MixedModel, Statistics
-from gz_onboard.discovery.mixed_model import initial as known_from
 from gz_onboard.discovery.search import (
     Rejected,
     Search,
@@ -78,10 +77,6 @@ def test_the_small_trial_is_passed(rows):
     assert sum(bool(reported(row)) for row in unknown) <= len(unknown) / 2
 
 
-def test_a_baseline_is_of_the_vehicle_that_was_learned(base):
-    assert base.healthy.vehicle.parameters.known == base.parameters.known
-
-
 def test_drag_on_rough_roads_is_found_over_vibration_and_mended(base):
     (case,) = plant.draw_many([FIRST + 9], "unknown", ("rough_drag",), truths=False)
     report = discovered(base, case.rides)
@@ -108,15 +103,6 @@ def test_winds_that_hardly_show_leave_it_inconclusive(base):
     assert any("there and back" in line for line in report["advice"])
 
 
-def test_a_cause_that_does_not_carry_over_counts_for_no_gain(base, ridden, monkeypatch):
-    (case, *_) = (case for case in ridden[1] if case.kind == "one" and case.truths[0].clear)
-    monkeypatch.setattr(judgement, "carries_over", lambda *_: False)
-    report = discovered(base, case.rides)
-    assert report["causes"] and all(cause["varies"] for cause in report["causes"])
-    errors = [metric for metric in report["gain"].values() if isinstance(metric, dict)]
-    assert errors and all(metric["after"] == metric["control"] for metric in errors)
-
-
 def test_a_healthy_scooter_of_strangers_is_left_alone():
     """Cold, nearly empty, where its baseline hardly went; against the file it has only what the model lacks."""
     first, (later,) = plant.healthy(6, [34])
@@ -128,11 +114,6 @@ def test_a_healthy_scooter_of_strangers_is_left_alone():
 
 
 # --- acceptance -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def mixed() -> MixedModel:
-    return known_from(read_vehicle("reference"))
 
 
 @pytest.mark.parametrize("name", ["resistance_growth", "current_sensor_gain", "capacity_fade", "cornering_drag"])
