@@ -251,7 +251,7 @@ class PackAge:
         slow, slow_measured = self._slow
         self._slow = slow + share * (unit - slow), slow_measured + share * (measured - slow_measured)
         quick, quick_measured = unit - slow, measured - slow_measured
-        if not self.is_learning or abs(quick) < AGE.excited:
+        if not dt or not self.is_learning or abs(quick) < AGE.excited:
             return state
         residual = quick_measured - state.resistance * quick
         state = self._backend.condition(state, (0.0, 0.0, quick), residual, AGE.quick_noise / dt, float("inf"))
