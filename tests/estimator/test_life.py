@@ -433,7 +433,7 @@ def test_a_doubted_current_is_still_compared_with_the_sag_of_the_voltage():
     """It is believed again once it explains the voltage; the current of the model, used meanwhile, proves nothing."""
     scooter, e = Scooter(soc=0.9), estimator()
     events = [event for event in scooter.live(400, 15.0) if event[1] != INVERTER]
-    tripled = ((t, g, (v[0], 3 * v[1], v[2]) if g == PACK and t > 120 else v) for t, g, v in events)
+    tripled = ((t, g, (v[0], 3 * (v[1] or 0.0), v[2]) if g == PACK and t > 120 else v) for t, g, v in events)
     _, end = follow(e, tripled, scooter)[-1]
     assert "pack_current" in end.distrusted
     assert end.current_modelled
