@@ -33,12 +33,12 @@ from gz_onboard.reports.results import FIRST_DATE_NS, clock, number
 from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import Vehicle, find_vehicle
 
-LEAST_WH = 0.05
+MIN_ENTRY_WH = 0.05
 """Smaller entries of the ledger are left out."""
 LONGEST_GAP_S = 10.0
 """Samples further apart have a hole between them."""
-MOST_CHANGES = 20
-TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")
+MAX_CHANGES = 20
+LEARNED_CAUSES = ("riding", "unexplained", "payload", "rolling", "drag")
 """Causes that a sensor which is left out may have taught."""
 
 Position = tuple[float, float]
@@ -273,7 +273,7 @@ def _ledger(ride: ReportedRide) -> str:
         per_km = f"{energy / distance:z.1f}" if distance >= 0.1 else "–"
         return Bar(name, 0.0, energy if colour else 0.0, colour, (f"{energy:z.1f}", per_km))
 
-    entries = {name: energy for name, energy in ride.ledger_wh().items() if abs(energy) >= LEAST_WH}
+    entries = {name: energy for name, energy in ride.ledger_wh().items() if abs(energy) >= MIN_ENTRY_WH}
     if not entries:
         return ""
     bars = [bar(name, energy, "blue" if energy > 0 else "green") for name, energy in entries.items()]
@@ -308,12 +308,12 @@ def _why(why: Why | None) -> str:
 
 
 def changed_by(change: Why) -> dict[str, float]:
-    """The causes of a change [km], in words; a sensor that is left out takes its teachings with it."""
+    """Causes of a change [km], in words; what a sensor that is left out has taught is one cause."""
     causes = {cause_words(name): km for name, km in change.causes_km.items()}
     if change.forgotten:
         left_out = " and ".join(map(words, change.forgotten))
-        taught = sum(causes.pop(cause_words(name), 0.0) for name in TAUGHT)
-        causes[f"{left_out} left out, what it taught forgotten"] = taught
+        learned = sum(causes.pop(cause_words(name), 0.0) for name in LEARNED_CAUSES)
+        causes[f"{left_out} left out, what it taught forgotten"] = learned
     return causes
 
 
@@ -322,9 +322,9 @@ def _changes(changes: Sequence[Why]) -> str:
     if not changes:
         return ""
     rows = []
-    for change in changes[-MOST_CHANGES:]:
+    for change in changes[-MAX_CHANGES:]:
         causes = ", ".join(f"{name} {km:+.1f}" for name, km in _largest(changed_by(change)))
         rows.append([clock(change.time_s), f"{change.range_km - change.reference_km:+.1f}", causes])
-    more = f"; the last {MOST_CHANGES} of {len(changes)}" if len(changes) > MOST_CHANGES else ""
+    more = f"; the last {MAX_CHANGES} of {len(changes)}" if len(changes) > MAX_CHANGES else ""
     title = f"<h3>Changes of the range, in km, beyond the distance ridden{more}</h3>"
     return f'{title}<div data-of="changes">{html_table(("at", "by", "why"), rows, (1,))}</div>'

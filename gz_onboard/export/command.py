@@ -117,26 +117,26 @@ def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) ->
     not_an_input([out] if suffix else [], [log, *(arguments.dbc or [])])
     source = ExportSource(log, arguments.start, arguments.end, arguments.columns)
     with whole(out, suffix) as part:
-        told = _write(arguments, source, part, suffix)
+        text = _write(arguments, source, part, suffix)
     for damage in dict.fromkeys(map(str, source.damages)):
         print(f"damaged log: {damage}")
-    print(f"wrote {out}: {told}")
+    print(f"wrote {out}: {text}")
 
 
 def _write(arguments: argparse.Namespace, source: ExportSource, part: Path, suffix: str) -> str:
     """Write what is asked for to `part`, in the format of `suffix`, none for a folder; return what it was."""
     kind = suffix or f"/.{arguments.table_format or 'parquet'}"
-    told = ["estimate"] if arguments.estimates else [name for name, t in ESTIMATES.items() if t in source.topics]
-    if arguments.estimates or (told and not (source.has_frames or arguments.signals or arguments.frames)):
-        return _estimates(arguments, source, part, kind, told)
+    tables = ["estimate"] if arguments.estimates else [name for name, t in ESTIMATES.items() if t in source.topics]
+    if arguments.estimates or (tables and not (source.has_frames or arguments.signals or arguments.frames)):
+        return _estimates(arguments, source, part, kind, tables)
     if arguments.frames or not (arguments.signals or suffix in (".parquet", ".jsonl", ".mcap", "")):
         return _frames(source, part, suffix)
     try:
         texts = [_signals(arguments, source, part, kind)]
     except DecoderError as error:
         raise InputError(f"{error}: --vehicle NAME|TOML, or --dbc FILE") from error
-    if not suffix and not arguments.signals and told:
-        texts.append(_estimates(arguments, source, part, kind, told))
+    if not suffix and not arguments.signals and tables:
+        texts.append(_estimates(arguments, source, part, kind, tables))
     return "; ".join(texts)
 
 

@@ -92,21 +92,21 @@ class DecodedLog:
 
     codec: one that has decoded nothing yet. It is left as if it had decoded all frames one by one: with the faults,
     the frames lost, unknown and copied, the leaps of the clock, the latest frames and the origins of the messages.
-    Times are since the first frame. odd: mask of frames whose time is wrong, which are not decoded.
+    Times are since the first frame. is_stray: mask of frames whose time is wrong, which are not decoded.
     """
 
-    def __init__(self, frames: FrameColumns | SignalColumns, codec: Codec, odd: Mask | None = None) -> None:
+    def __init__(self, frames: FrameColumns | SignalColumns, codec: Codec, is_stray: Mask | None = None) -> None:
         self.frames = frames if isinstance(frames, FrameColumns) else FrameColumns.of([])
         self.codec, self._time_ns = codec, frames.time_ns
-        self._odd = np.zeros(len(frames), bool) if odd is None else odd
-        timed = np.flatnonzero(~self._odd)
+        self._is_stray = np.zeros(len(frames), bool) if is_stray is None else is_stray
+        timed = np.flatnonzero(~self._is_stray)
         is_kept, self._passed_ns = np.zeros(len(frames), bool), np.zeros(len(frames), np.int64)
         is_kept[timed], self._passed_ns[timed] = on_timeline(frames.time_ns[timed], codec)
         kept = np.flatnonzero(is_kept)
         following = (np.cumsum(is_kept) - is_kept).clip(max=max(len(kept) - 1, 0))
         latest = np.maximum.accumulate(self._passed_ns[kept])
         self._now_ns = latest[following]  # when each frame came: one of a wrong time with the next of a good one
-        codec.faults.clear()  # of odd times, counted here with their frames
+        codec.faults.clear()  # of stray times, counted here with their frames
         self._events: list[tuple[dict[Any, int], Any, Rows, NDArray[np.int64]]] = []
         self._count(vars(codec), "received", np.arange(len(frames)))
         self._count(codec.faults, ("", TIME), np.flatnonzero(~is_kept))
@@ -179,7 +179,7 @@ class DecodedLog:
 
     def tuples(self, rows: slice) -> list[Frame]:
         """The frames of a part of the log but those of wrong times."""
-        return self.frames[rows][~self._odd[rows]].tuples()
+        return self.frames[rows][~self._is_stray[rows]].tuples()
 
     def _count(self, counts: dict[Any, int], key: Any, rows: Rows, numbers: NDArray[np.int64] | None = None) -> None:
         """Have `counts[key]` count the frames in these rows, or these numbers at them."""
@@ -304,9 +304,11 @@ class DecodedLog:
         return {role: (column[:, 0], column[:, 1]) for role, column in columns.items()}
 
 
-def decode_columns(frames: FrameColumns | SignalColumns, codec: Codec, odd: Mask | None = None) -> dict[str, Column]:
+def decode_columns(
+    frames: FrameColumns | SignalColumns, codec: Codec, is_stray: Mask | None = None
+) -> dict[str, Column]:
     """Decode `frames`: see `DecodedLog.samples`."""
-    return DecodedLog(frames, codec, odd).samples()
+    return DecodedLog(frames, codec, is_stray).samples()
 
 
 def feed(pipeline: Pipeline, frames: FrameColumns | SignalColumns, progress: Progress | None = None) -> None:

@@ -72,10 +72,14 @@ class FrameColumns:
         """The frames of all parts, one part after the other."""
         if len(parts) < 2:
             return parts[0] if parts else cls.of([])
-        width = max(part.data.shape[1] for part in parts)
-        data = [np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))) for part in parts]
-        scalars = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _SCALARS}
-        return cls(**scalars, data=np.concatenate(data))
+        whole = cls.empty(sum(map(len, parts)), max(part.data.shape[1] for part in parts))
+        end = 0
+        for part in parts:
+            start, end = end, end + len(part)
+            for name in _SCALARS:
+                getattr(whole, name)[start:end] = getattr(part, name)
+            whole.data[start:end, : part.data.shape[1]] = part.data
+        return whole
 
     def __len__(self) -> int:
         return len(self.time_ns)
