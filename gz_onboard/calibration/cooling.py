@@ -239,7 +239,7 @@ def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     result = np.empty((2, len(run.time)))
     rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), run.air.tolist(), strict=True)
     for k, (heat, ambient, air) in enumerate(rows):
-        result[:, k] = network.board, network.box
+        result[:, k] = network.temperature, network.box
         network.step(PERIOD, heat, ambient, air)
     return {board: result[0], box: result[1]}
 

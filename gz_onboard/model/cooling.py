@@ -22,24 +22,19 @@ class InverterCooling:
     """Board and box with air between them (eqs. 2.25-2.27; 2.27 is printed without the sign of its first term)."""
 
     parameters: Mapping[str, float]
-    board: float  # degC
+    temperature: float  # degC, of the board, which has the sensor
     box: float  # degC
-
-    @property
-    def temperature(self) -> float:
-        """Temperature of the board [degC], which has the sensor."""
-        return self.board
 
     def step(self, dt: float, heat: float, ambient: float, air: float = 0.0, factor: float = 1.0) -> None:
         """Advance by `dt` [s]. The air between board and box stores no heat."""
         p = self.parameters
         board_to_air, box_to_air = p["inverter_board_to_air"], p["inverter_box_to_air"]
         outside = factor * (p["inverter_box_to_ambient"] + p["inverter_box_per_speed"] * air)
-        between = (self.board * board_to_air + self.box * box_to_air) / (board_to_air + box_to_air)
-        across = p["inverter_board_to_box"] * (self.board - self.box)
-        board = heat - board_to_air * (self.board - between) - across
+        between = (self.temperature * board_to_air + self.box * box_to_air) / (board_to_air + box_to_air)
+        across = p["inverter_board_to_box"] * (self.temperature - self.box)
+        board = heat - board_to_air * (self.temperature - between) - across
         box = box_to_air * (between - self.box) + across - outside * (self.box - ambient)
-        self.board += dt * board / p["inverter_board_capacity"]
+        self.temperature += dt * board / p["inverter_board_capacity"]
         self.box += dt * box / p["inverter_box_capacity"]
 
 
@@ -52,24 +47,19 @@ class MotorCooling:
     """
 
     parameters: Mapping[str, float]
-    stator: float  # degC
+    temperature: float  # degC, of the stator, which has the sensor
     rotor: float  # degC
-
-    @property
-    def temperature(self) -> float:
-        """Temperature of the stator [degC], which has the sensor."""
-        return self.stator
 
     def step(
         self, dt: float, heat: float, ambient: float, air: float = 0.0, factor: float = 1.0, idle: float = 0.0
     ) -> None:
         """Advance by `dt` [s]; idle: the part of `heat` [W] that is lost without current."""
         p = self.parameters
-        across = p["motor_gap_conductance"] * (self.stator - self.rotor)
+        across = p["motor_gap_conductance"] * (self.temperature - self.rotor)
         of_rotor = (1 - p["motor_iron_share"]) * idle
         outside = factor * (p["motor_rotor_to_ambient"] + p["motor_rotor_per_speed"] * air)
         rotor = of_rotor + across - outside * (self.rotor - ambient)
-        self.stator += dt * (heat - of_rotor - across) / p["motor_stator_capacity"]
+        self.temperature += dt * (heat - of_rotor - across) / p["motor_stator_capacity"]
         self.rotor += dt * rotor / p["motor_rotor_capacity"]
 
 

@@ -193,8 +193,8 @@ def scooter_at_start(
     air = measured("ambient_temperature", MILD) if ambient is None else ambient
     cell, speed = measured("cell_temperature", air), measured("speed", 0.0)
     scooter = Scooter(vehicle, road, ambient=air, cell_temperature=cell, speed=speed, **options)
-    scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", air)
-    scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", air)
+    scooter.motor_cooling.temperature = scooter.motor_cooling.rotor = measured("motor_temperature", air)
+    scooter.inverter_cooling.temperature = scooter.inverter_cooling.box = measured("inverter_temperature", air)
     return scooter
 
 

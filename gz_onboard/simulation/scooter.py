@@ -247,7 +247,7 @@ class Scooter:
         self.sensed_voltage += (self.voltage - self.sensed_voltage) * self._voltage_gain
         current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / self._series)
         # The motor's current makes torque in the air gap; its loss without current is drag on the shaft.
-        stator = self.motor_cooling.stator
+        stator = self.motor_cooling.temperature
         if self.motor:
             idle = self.motor.loss(w / gear, 0.0, stator)
         else:
@@ -381,9 +381,9 @@ class Scooter:
         self.bms_cooling.step(dt, mean["bms"], self.pack_cooling.temperature)
         self._cooled = dict(self._booked)
         self._since_cooling = 0.0
-        self._q["motor_temperature"] = self.motor_cooling.stator
+        self._q["motor_temperature"] = self.motor_cooling.temperature
         self._watch()
 
     def _watch(self) -> None:
-        motor, inverter = self.motor_cooling.stator, self.inverter_cooling.board
+        motor, inverter = self.motor_cooling.temperature, self.inverter_cooling.temperature
         self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)

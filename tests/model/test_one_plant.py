@@ -41,7 +41,7 @@ def simulated():
         for _ in range(100):
             scooter.step(*rider.step(wanted, scooter.speed, scooter.dt))
             steps.append((scooter.speed, scooter.current, scooter.motor_current, scooter.voltage))
-        rows.append((*np.mean(steps, axis=0), scooter.motor_cooling.stator, scooter.pack_cooling.temperature))
+        rows.append((*np.mean(steps, axis=0), scooter.motor_cooling.temperature, scooter.pack_cooling.temperature))
     names = ("speed", "pack_current", "motor_current", "pack_voltage", "motor_temperature", "cell_temperature")
     return dict(zip(names, np.array(rows).T, strict=True))
 
@@ -222,7 +222,7 @@ def test_validation_discovery_and_simulation_warm_the_inverter_alike(ride):
     heat = losses(VEHICLE, ride["motor_current"], ride["motor_speed"], ride["motor_temperature"])[2]
     for watts, speed in zip(heat[:-1], ride["speed"][:-1], strict=True):
         cooling.step(1.0, watts, AMBIENT, speed, P["cooling_factor"])
-    assert cooling.board == pytest.approx(by_validation[-1], abs=1e-6)
+    assert cooling.temperature == pytest.approx(by_validation[-1], abs=1e-6)
 
 
 def test_everyone_has_the_same_heat_of_the_reaction(ride):

@@ -81,11 +81,11 @@ def test_2_8_torque_constant_makes_the_force():
 
 
 def test_2_9_and_2_10_motor_heat_is_its_loss(riding):
-    riding.motor_cooling.stator = 70.0
+    riding.motor_cooling.temperature = 70.0
     watts, _, wheel = parted(riding, 0.5)
     current = riding.motor_current
     resistance = P["motor_copper_resistance"] * (
-        1 + P["motor_copper_temperature_coefficient"] * (riding.motor_cooling.stator - 25)
+        1 + P["motor_copper_temperature_coefficient"] * (riding.motor_cooling.temperature - 25)
     )
     resistance *= 1 + P["motor_copper_frequency"] * wheel**2
     assert watts["motor_copper_loss"] == pytest.approx(resistance * current**2, rel=1e-9)
@@ -188,7 +188,7 @@ def test_2_25_to_2_27_inverter_cooling():
     box = InverterCooling({f"inverter_{name}": size for name, size in sizes.items()}, 50.0, 30.0)
     box.step(1.0, 40.0, 20.0, 10.0)  # in 10 m/s of air
     air = (50.0 * 1.5 + 30.0 * 3.0) / 4.5
-    assert box.board == pytest.approx(50.0 + (40.0 - 1.5 * (50.0 - air) - 4.0 * 20.0) / 600.0)
+    assert box.temperature == pytest.approx(50.0 + (40.0 - 1.5 * (50.0 - air) - 4.0 * 20.0) / 600.0)
     assert box.box == pytest.approx(30.0 + (3.0 * (air - 30.0) + 4.0 * 20.0 - 4.0 * 10.0) / 2200.0)
 
 
@@ -204,7 +204,7 @@ def test_2_28_and_2_29_motor_cooling():
     sizes = dict(zip(names, (3000.0, 4000.0, 8.0, 4.0, 0.2, 0.6), strict=True))
     motor = MotorCooling({f"motor_{name}": size for name, size in sizes.items()}, 60.0, 40.0)
     motor.step(1.0, 100.0, 20.0, 10.0, idle=25.0)  # 10 of the 25 W in the rotor
-    assert motor.stator == pytest.approx(60.0 + (90.0 - 8.0 * 20.0) / 3000.0)
+    assert motor.temperature == pytest.approx(60.0 + (90.0 - 8.0 * 20.0) / 3000.0)
     assert motor.rotor == pytest.approx(40.0 + (10.0 + 8.0 * 20.0 - 6.0 * 20.0) / 4000.0)
 
 
@@ -239,9 +239,9 @@ def test_2_24_to_2_31_each_network_takes_its_own_heat():
     for _ in range(100):
         scooter.step(0.5, 0.0)
     e, motor, box = scooter.ledger, scooter.motor_cooling, scooter.inverter_cooling
-    gained = P["motor_stator_capacity"] * (motor.stator - 20) + P["motor_rotor_capacity"] * (motor.rotor - 20)
+    gained = P["motor_stator_capacity"] * (motor.temperature - 20) + P["motor_rotor_capacity"] * (motor.rotor - 20)
     assert gained == pytest.approx(e["motor_copper_loss"] + e["motor_iron_loss"], rel=1e-9)
-    gained = P["inverter_board_capacity"] * (box.board - 20) + P["inverter_box_capacity"] * (box.box - 20)
+    gained = P["inverter_board_capacity"] * (box.temperature - 20) + P["inverter_box_capacity"] * (box.box - 20)
     assert gained == pytest.approx(e["inverter_loss"], rel=1e-9)
     warmed = P["pack_heat_capacity"] * (scooter.pack_cooling.temperature - 20)
     assert warmed == pytest.approx(e["battery_heat"] + e["bms"] + reaction_heat(scooter, 20.0), rel=1e-3)
