@@ -114,10 +114,11 @@ def check_ride(
 ) -> tuple[list[Finding], PackRide | None]:
     """Return the findings of a ride about itself and the vehicle file, and its pack; payload [kg], if known."""
     ways = check_speeds(ride, vehicle)
-    trusted = {role: values for role, values in ride.items() if role not in accused(ways.findings)}
+    findings = [*ways.findings, *check_limits(ride, ways.best, ways.bench)]
+    trusted = {role: values for role, values in ride.items() if role not in accused(findings)}
     by_others, pack = check_predictions(trusted, vehicle, ways.best if ways.sure else None, payload)
     by_cells = check_cells(ride, pack, accused(by_others)) if pack else []
-    return [*ways.findings, *by_others, *by_cells, *check_limits(ride, ways.best, ways.bench)], pack
+    return [*findings, *by_others, *by_cells], pack
 
 
 # --- frames and signals -----------------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ RANGES = (
 )
 NEAR, FAR = 15.0, 25.0  # K between cells and air: usual; out of a warm room
 FAHRENHEIT = 8.0  # K: so near the air are cells that were read in °F
-WARMED = 5.0  # K, that cells or air change by while riding, and thrice the motor: exchanged
+WARMED = 5.0  # K, that cells or air change by while riding, and many times the motor: exchanged
 STEADY = {"brake_switch", "charge_plug", "key", "contactor", "rider", "gps_fix", "odometer", "bms_state_of_charge"}
 STEADY |= {"ambient_temperature", "cell_temperature", "motor_temperature", "inverter_temperature", "heater_power"}
 STEADY |= {"air_conditioner_power", "auxiliary_current"}
@@ -138,6 +138,6 @@ def _exchanged_temperatures(ride: Mapping[str, Array], moving: Mask) -> Iterator
             spans[role] = float(np.ptp(known))
     motor = spans.pop("motor_temperature", np.inf)
     for role, span in spans.items():
-        if span > WARMED and span > 3 * motor:
+        if span > WARMED and span > 2.5 * motor:
             text = f"changes by {span:.0f} K while riding, and motor_temperature by {motor:.0f} K: swapped?"
             yield wrong("temperature", (role, "motor_temperature"), text)

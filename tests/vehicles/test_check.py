@@ -160,6 +160,13 @@ def test_a_mistake_is_reported_once_and_accuses_nothing_else(rides, role, factor
         assert said.roles == (role,)
 
 
+def test_a_current_without_its_sign_is_named():
+    recorded = read_recording(LOGS / "calibration/ride_000.blf", read_vehicle("reference"))
+    times, current = recorded.columns["pack_current"]
+    (said,) = wrong_of(checked(replace(recorded, columns={**recorded.columns, "pack_current": (times, abs(current))})))
+    assert (said.check, said.roles) == ("current while braking", ("pack_current",))
+
+
 def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):
     standing = dict.fromkeys(GROUND, 1e-12)
     findings = checked(rides[0], **standing)
