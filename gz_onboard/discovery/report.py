@@ -211,8 +211,9 @@ def cause_rows(report: Report) -> list[list[str]]:
 def _cause_lines(report: Report) -> list[str]:
     lines = []
     for name, parameter, value, interval, change, share, score in cause_rows(report):
-        more = f"; change {change}), {share} of the energy, score {score}" if name else ")"
-        lines.append(f"  {name:20} {parameter} = {value} (95 %: {interval}{more}")
+        changed = f"; change {change}" if change.removeprefix("+") not in ("", value) else ""
+        more = f", {share} of the energy, score {score}" if name else ""
+        lines.append(f"  {name:20} {parameter} = {value} (95 %: {interval}{changed}){more}")
     return lines
 
 
