@@ -10,9 +10,10 @@ from typing import Annotated
 import numpy as np
 import pytest
 
+from gz_onboard.discovery.judgement import Errors, Gain, Report
 from gz_onboard.errors import InputError
 from gz_onboard.reports.page import Failed, Subheading, html_table, markdown_table
-from gz_onboard.reports.results import clock, number, text_rows, times, to_json, write_json
+from gz_onboard.reports.results import OPTIONAL, clock, descriptions, number, text_rows, times, to_json, write_json
 
 NAN = float("nan")
 
@@ -27,12 +28,14 @@ class Outer:
     first: Annotated[float, "the first"]
     second: Annotated[list[Inner], "the second"]
     third: str = ""
+    fourth: Annotated[str | None, OPTIONAL, "left out where it is None"] = None
 
 
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
         (Outer(NAN, [Inner(1.0)]), {"first": None, "second": [{"value": 1.0}], "third": ""}),
+        (Outer(1.0, [], fourth="a"), {"first": 1.0, "second": [], "third": "", "fourth": "a"}),
         (np.array([[1.0, NAN], [np.inf, 2.0]]), [[1.0, None], [None, 2.0]]),
         ({1: (np.float64(0.1), np.int64(3), np.bool_(True))}, {"1": [0.1, 3, True]}),
         (Path("a/b"), "a/b"),
@@ -73,3 +76,15 @@ def test_the_same_table_as_html_and_markdown():
     assert "<td class=bad>9.0</td>" in page
     assert "<td class=n>1.0</td>" in page
     assert markdown_table(heads, rows) == "| ride | % |\n| --- | --- |\n| *speed <* |  |\n| a | 1.0 |\n| b | **9.0** |"
+
+
+def test_the_report_of_a_discovery_has_the_keys_that_it_explains():
+    gain = Gain(("ride",), apart=False, power=Errors(3.0, 2.0, 1.0, (0.1, 0.2)))
+    written = to_json(Report("none", [], [], None, [], {}, gain))
+    assert isinstance(written, dict)
+    assert list(written) == ["version", *descriptions(Report)]
+    assert written["gain"] == {
+        "holdout": ["ride"],
+        "apart": False,
+        "power": {"before": 3.0, "control": 2.0, "after": 1.0, "ci95": [0.1, 0.2]},
+    }
