@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.discovery.channels import CHANNEL
+from gz_onboard.discovery.curves import CurveFit, curve_form
 from gz_onboard.discovery.judgement import (
     Discovery,
     Errors,
@@ -19,11 +20,13 @@ from gz_onboard.discovery.judgement import (
     ResidualSize,
     Score,
     errors,
+    form_error,
     implausible_explanations,
     judge,
     limits,
     missing_residuals,
     outlying_rides,
+    relative_size,
     remaining_error,
     summarised,
 )
@@ -167,6 +170,20 @@ def test_one_ride_held_out_has_no_interval(found: Discovery):
 
 
 # --- limits and notes -----------------------------------------------------------------------------------------------
+
+
+def test_a_curve_is_compared_with_the_causes_effect_in_its_channel(mixed: MixedModel, line: LinearRide):
+    """Of a constant of 2 N; a curve of more than a tenth of the effect is no correction of its form."""
+    now = replace(search_of(mixed, [line]), chosen=("rolling_resistance",))
+    form = curve_form("road_force", "speed")
+    k = len(form.knots)
+    curve = CurveFit(form, 1.0, 1.0, 1.0, k, np.full(k, 2.0), np.eye(k))
+    table = line.tables["road_force"]
+    effect = table.a @ now.change * table.unit
+    assert np.any(effect)
+    found = relative_size(now, curve) * np.sqrt(np.mean((effect / table.unit) ** 2))
+    assert found == pytest.approx(2.0 * np.sqrt(np.mean(1 / table.unit**2)))
+    assert (2 * form_error({"road_force": 1.0}), 2 * form_error({"cell_voltage": 1.0})) == (0.1, 0.2)
 
 
 def test_limits_shrink_with_the_rides(mixed: MixedModel, line: LinearRide):
