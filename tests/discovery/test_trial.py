@@ -24,7 +24,7 @@ from benchmarks.trial import (
     with_section,
 )
 from benchmarks.trial import summary as counted
-from gz_onboard.discovery import search
+from gz_onboard.discovery import judgement, search
 from gz_onboard.discovery.baseline import baseline
 from gz_onboard.discovery.grid import Ride
 from gz_onboard.discovery.judgement import VERDICTS
@@ -32,6 +32,7 @@ from gz_onboard.discovery.mixed_model import LinearRide, MixedModel, Statistics
 from gz_onboard.discovery.search import (
     Rejected,
     Search,
+    Split,
     carries_over,
     improves,
     with_observed_scatter,
@@ -101,6 +102,15 @@ def test_winds_that_hardly_show_leave_it_inconclusive(base):
     assert report["gain"]["range"]["after"] > 0.08
     assert any("is missed on rides held out" in note for note in report["notes"])
     assert any("there and back" in line for line in report["advice"])
+
+
+def test_a_cause_that_some_rides_do_not_have_varies(base, ridden, monkeypatch):
+    (case, *_) = (case for case in ridden[1] if case.kind == "one" and case.truths[0].clear)
+    monkeypatch.setattr(judgement, "splits", lambda now: [Split(name, "ride a", -0.9, 20.0) for name in now.chosen])
+    report = discovered(base, case.rides)
+    assert report["causes"] and all(cause["varies"] for cause in report["causes"])
+    errors = [metric for metric in report["gain"].values() if isinstance(metric, dict)]
+    assert errors and all(metric["after"] == metric["control"] for metric in errors)
 
 
 def test_a_healthy_scooter_of_strangers_is_left_alone():
