@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import struct
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from statistics import median
 
 import pytest
 
+from gz_onboard.can.recorder import is_complete
 from gz_onboard.events import State
 from tests.support import S, Scooter
 from tests.vcan.support import Daemon, Listener, Running, ip, number, raw_frames, wait_for
@@ -261,3 +263,34 @@ def test_the_clock_is_set(running: Running, listener: Listener):
     assert "implausible time" not in daemon.statuses()[-1]["faults"]
     soc = [row["soc"] for row in riding if row["soc"] is not None]
     assert max(soc) - min(soc) < 0.005
+
+
+@pytest.mark.administers
+def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
+    """Others fill it, and room again: the log leaves them their share, and goes on in a new file."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=False, capture_output=True
+    )
+    if mount.returncode:
+        pytest.skip(f"no mount here: {mount.stderr.decode()}")
+    try:
+        daemon = running.daemon("--log-dir", str(disk))
+        with steady_ride():
+            listener.wait_for_valid(4)
+            assert not listener.decoded("RANGE_Status")[-1]["RANGE_LogFailed"]
+            (disk / "ballast").write_bytes(bytes(1_800_000))
+            listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
+            wait_for(lambda: "cannot write the log" in daemon.journal, 10, "it says that the disk is full")
+            (disk / "ballast").unlink()
+            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
+            time.sleep(3)
+        daemon.stop()
+        logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+        assert len(logs) >= 2
+        assert all(is_complete(log) for log in logs)
+        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))
+    finally:
+        running.kill()
+        subprocess.run(["umount", str(disk)], check=False)
