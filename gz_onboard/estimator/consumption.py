@@ -43,6 +43,7 @@ class ConsumptionConfig:
     recent_m: float = 1000.0  # the same for the recent consumption
     prior_m: float = 3000.0  # riding that the prior riding counts for in the sums
     history_segments: int = 40  # 10 km that a fault found later can be unlearned of
+    acceleration_limit: float = 15.0  # m/s²: no road gives more; a second that shows more is left out
     ride_ends_s: float = 600.0  # standstill after which another ride begins
     tyres_cool_s: float = 3600.0  # standstill after which tyres are cold
     # Filters
@@ -406,6 +407,9 @@ class ConsumptionLearner:
             return
         start = speed if second.start_speed is None else second.start_speed
         mean, acceleration = second.distance / second.seconds, (speed - start) / second.seconds
+        if abs(acceleration) > c.acceleration_limit:  # a sensor errs, or the wheel spins
+            self.pause()
+            return
         way, moving = abs(second.distance), abs(mean) > MOVING
         slope = max(min(second.climb / way, MOTION.max_grade), -MOTION.max_grade) if moving else 0.0
         q = self.load.quantities(mean, acceleration, conditions, slope, self.load.time_moving)

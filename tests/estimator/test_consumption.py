@@ -105,6 +105,16 @@ def test_recent_consumption_is_that_of_about_the_last_kilometre():
     assert learner.expected(30e3, 20.0, 0.0).recent == pytest.approx(50 + 40 * (1 - np.exp(-1)), rel=0.03)
 
 
+def test_a_second_of_a_speed_that_no_road_gives_is_not_learned():
+    """A lone speed sensor that reads 55 m/s for a second in each minute at 10 m/s."""
+    clean, spiked = fresh(), fresh()
+    for _ in range(20):
+        for learner, last in ((clean, 10.0), (spiked, 55.0)):
+            steady(learner, 590, 600.0)
+            learner.ride(1.0, last, 0.0, 600.0, AIR)
+    assert spiked.factor == pytest.approx(clean.factor, rel=0.01)
+
+
 def test_a_segment_that_no_riding_explains_counts_for_little():
     """A ferry queue that costs a hundred times the price moves it by a tenth."""
     quantity = quantity_of(0.05, 0.055, 0.2)
