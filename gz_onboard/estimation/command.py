@@ -132,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
     write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
     if arguments.table:
         write_summaries(arguments.table, rides, failed)
-    if file and file.exists() and arguments.json != "-":
+    if file and rides and file.exists() and arguments.json != "-":
         shown = f"--vehicle {arguments.vehicle} --state {file}"
         print(f"what was learned is in {file}; `gz-onboard learned {shown}` shows it")
     return BAD_INPUT if failed else OK
@@ -265,7 +265,9 @@ _digest_once = functools.lru_cache(maxsize=None)(digest_of)  # of the files that
 def _kept_summary(task: EstimateTask) -> RideSummary | None:
     """Return the summary of an earlier run, if its log and its picture are complete and had the same inputs."""
     try:
-        if not is_complete(task.log) or (task.picture and not task.picture.exists()):
+        if not is_complete(task.log):
+            return None
+        if task.picture and task.picture.stat().st_mtime_ns < task.log.stat().st_mtime_ns:  # of another run
             return None
         found = read_metadata(task.log, _RECORD)
     except (OSError, InputError):

@@ -68,7 +68,7 @@ def resume(pipeline: Pipeline, at: RideState, ride: Path) -> Resumed:
             previous = state.copies(at.file)[1]
             older = f"; the one before it is {previous}" if copy != previous and previous.exists() else ""
             raise InputError(
-                f"{copy}: {error}; give the state of this vehicle; to begin anew, give a new name, of no file "
+                f"{ride}: {copy}: {error}; give the state of this vehicle; to begin anew, give a new name, of no file "
                 f"yet{older}"
             ) from error
         resumed = Resumed(True, age)

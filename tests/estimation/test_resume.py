@@ -104,3 +104,14 @@ def test_a_ride_whose_picture_is_missing_is_made_again(tmp_path):
     picture.unlink()
     assert run(tmp_path, "--resume")[0]["cpu_s"] > 0
     assert picture.read_bytes() == drawn
+
+
+def test_the_picture_of_another_run_is_drawn_again(tmp_path):
+    short_log(tmp_path / "a.blf")
+    run(tmp_path)
+    picture = tmp_path / "a.estimate.png"
+    drawn = picture.read_bytes()
+    run(tmp_path, "--no-plot", "--payload", "190")
+    assert picture.read_bytes() == drawn
+    run(tmp_path, "--payload", "190", "--resume")
+    assert picture.read_bytes() != drawn

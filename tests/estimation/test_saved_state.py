@@ -199,7 +199,7 @@ def refused(out: Path, capsys: pytest.CaptureFixture[str], *rides: Path, options
     before = written()
     assert estimate(out, *rides, options=options) == 2
     assert written() == before
-    return capsys.readouterr().err
+    return "".join(capsys.readouterr())
 
 
 def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
@@ -273,7 +273,9 @@ def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):
         out, capsys, short, options=["--vehicle", tmp_path / "other.toml"]
     )
     (out / "s.json").write_bytes(before[:-9])
-    assert "s.json: is damaged: its checksum is wrong" in refused(out, capsys, short)
+    said = refused(out, capsys, short)
+    assert f"{short}: {out / 's.json'}: is damaged: its checksum is wrong" in said
+    assert "what was learned" not in said
     (out / "s.json").write_bytes(state.encode({"version": 1}, 1.7e9))
     assert "is of version 1" in refused(out, capsys, short)
     (out / "s.json").write_bytes(before)
