@@ -50,7 +50,7 @@ def correlations(vehicle: Vehicle) -> dict[frozenset[str], float]:
             if row[i] != 1:
                 raise table.error(f"the diagonal must be 1, is {row[i]:g}", "value")
         found |= {frozenset((names[i], names[j])): rows[i][j] for i, j in combinations(range(n), 2)}
-        if np.linalg.eigvalsh(rows)[0] < -0.01:  # by more than the rounding to two digits
+        if np.linalg.eigvalsh(rows)[0] < -0.0015 * (n - 1):  # rounding to two digits errs by less
             raise table.error("no parameters can have these correlations together: a variance is negative", "value")
     return found
 

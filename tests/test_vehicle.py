@@ -267,6 +267,11 @@ def test_parameters_that_were_found_together_are_tied(tmp_path):
             'constant", "wheelbase"]\nvalue = [[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]',
             "a variance is negative",
         ),
+        (
+            'constant"]\nvalue = [[1.0, 0.86], [0.86, 1.0]]',
+            'constant", "wheelbase"]\nvalue = [[1, 0.9, 0.9], [0.9, 1, 0.61], [0.9, 0.61, 1]]',
+            "a variance is negative",
+        ),
     ],
 )
 def test_a_correlation_that_is_none_is_refused(tmp_path, old, new, says):

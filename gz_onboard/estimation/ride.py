@@ -161,7 +161,7 @@ class MemoryLog:
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[int, Mapping[str, object]]]] = {}
 
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+    def channel(self, topic: str, json_schema: Mapping[str, Any]) -> None:
         """See `log_rows.Log`."""
         self.rows[topic] = []
 
