@@ -33,6 +33,7 @@ class WayCheckConfig:
     """Tolerances. Recorded rides: 29 are within 0.8 % of the GPS, three with soft tyres 1.1 %."""
 
     apart: float = 0.04  # relative, of two ways that agree
+    standing: float = 1e-5  # of the reference: rounding moves a position that stands by less, and no unit is as small
     odometer_apart: float = 0.05  # relative, and twice its steps
     shortest_m: float = 300.0  # way that is compared
     odometer_steps: int = 5  # at least
@@ -72,6 +73,11 @@ class Way:
     def roles(self) -> Roles:
         """The signals that it is made of."""
         return PLACE if self.name == POSITIONS else (self.name,)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it shows no way where the reference moves."""
+        return self.ratio < WAY_CHECK.standing
 
     def explanation(self, right_ratio: float) -> str:
         """Name the mistake if the way should be `right_ratio` times that of the reference."""
@@ -125,6 +131,10 @@ def _compare(ride: Mapping[str, Array], found: Speeds, vehicle: Vehicle) -> None
             ways.append(way)
         elif way:
             found.findings.append(way)
+    for way in ways:
+        if way.stands:
+            found.findings.append(wrong(BY_WAYS, way.roles, f"{way.name} stands while {pivot} moves"))
+    ways = [way for way in ways if not way.stands]
     if len(ways) < 2:
         found.findings.append(unknown(BY_WAYS, roles, "there is no other way to compare it with"))
         return

@@ -174,6 +174,31 @@ def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):
     assert not [one for one in findings if one.check == "stuck"]
 
 
+@pytest.mark.parametrize(
+    ("name", "roles", "value"),
+    [
+        ("motor_speed", ("motor_speed",), 0.0),
+        ("wheel_speed_front", ("wheel_speed_front",), 0.0),
+        ("gps_speed", ("gps_speed",), 0.0),
+        ("odometer", ("odometer",), 0.0),
+        ("odometer", ("odometer",), 40e6 / 3),
+        ("positions", ("latitude", "longitude"), 0.0),
+        ("positions", ("latitude", "longitude"), 40.3),
+    ],
+)
+def test_a_source_that_stands_is_named_and_the_others_agree(rides, name, roles, value):
+    columns = dict(rides[0].columns)
+    for role in roles:
+        times, values = columns[role]
+        columns[role] = (times, np.full_like(values, value))
+    findings = checked(replace(rides[0], columns=columns))
+    those = [one for one in findings if one.check == BY_WAYS]
+    assert [(one.looks, one.roles) for one in those[:1]] == [(Looks.WRONG, roles)]
+    assert those[0].text == f"{name} stands while wheel_speed_rear moves"
+    assert [one.looks for one in those[1:]] == [Looks.RIGHT]
+    assert {role for one in wrong_of(findings) for role in one.roles} == set(roles)
+
+
 @pytest.mark.parametrize("seconds", [0.05, 2, 4])
 def test_a_log_of_moments_cannot_tell(tmp_path, seconds):
     cut = ["export", str(LOGS / "coastdown.blf"), str(tmp_path / "cut.blf"), "--from", "20", "--to", str(20 + seconds)]
