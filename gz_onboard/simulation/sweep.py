@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -14,7 +13,6 @@ from gz_onboard.vehicle import Vehicle
 CELLS = ("battery.cells_parallel", "battery.cells_series")
 _SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
 _STEPS = 5
-_NUMBER = r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)"
 _MOST_STEPS = 50
 
 
@@ -38,16 +36,19 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     Without STEPS five values; of cells every number, up to nine. InputError for an unknown name (with the nearest),
     a value out of the parameter's bounds (with its unit), and any other form.
     """
-    given = re.fullmatch(rf"([^=]+)={_NUMBER}\.\.{_NUMBER}(?::(\d+))?", text)
-    if given is None:
+    name, _, rest = text.partition("=")
+    span, _, steps = rest.partition(":")
+    try:
+        low, high = map(float, span.split("..", 1))
+        wanted = int(steps) if steps else None
+    except ValueError:
         form = "must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5"
-        raise InputError(f"--sweep {text}: {form}")
-    name, low, high, steps = given[1].strip(), float(given[2]), float(given[3]), given[4]
-    found = sweep_of(name, (low, high), vehicle, f"--sweep {text}")
+        raise InputError(f"--sweep {text}: {form}") from None
+    found = sweep_of(name.strip(), (low, high), vehicle, f"--sweep {text}")
     if not low < high:
         raise InputError(f"--sweep {text}: {low:g} is not below {high:g}")
     of_cells = found.name in CELLS
-    count = int(steps) if steps else min(round(high - low) + 1, 9) if of_cells else _STEPS
+    count = wanted if wanted is not None else min(round(high - low) + 1, 9) if of_cells else _STEPS
     if not 2 <= count <= _MOST_STEPS:
         raise InputError(f"--sweep {text}: {count} steps; must be 2 to {_MOST_STEPS}")
     values = [low + (high - low) * i / (count - 1) for i in range(count)]

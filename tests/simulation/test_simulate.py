@@ -11,6 +11,8 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.simulation.run import COLUMNS
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
+from gz_onboard.simulation.sweep import read_sweep
+from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
 
 PNG = b"\x89PNG"
@@ -123,6 +125,12 @@ def test_sweep_of_one_parameter(short, tmp_path, capsys):
     assert (tmp_path / "short.simulation.sweep.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.parametrize("bounds", ["0.4..1.", "0.4 .. 1", ".4..1e0", "4e-1..+1.0", " 0.4..1:5"])
+def test_bounds_of_a_sweep_are_numbers_of_any_form(bounds):
+    sweep = read_sweep(f"drag_area={bounds}", read_vehicle("reference"))
+    assert sweep.values == pytest.approx((0.4, 0.55, 0.7, 0.85, 1.0))
+
+
 def test_sweep_of_two(short, tmp_path, capsys):
     sweeps = ("--sweep", "battery.parallel=10..12", "--sweep", "payload_mass=60..120:2")
     assert simulate(short, *sweeps, "--format", "svg", "--format", "csv", "--output", tmp_path) == 0
@@ -154,6 +162,9 @@ def test_sweep_of_two(short, tmp_path, capsys):
         (["ece15", "--sweep", "drag_area=0.6..0.4"], ["0.6", "below"]),
         (["ece15", "--sweep", "drag_area"], ["NAME=LOW..HIGH"]),
         (["ece15", "--sweep", "drag_area=a..b"], ["must be NAME=LOW..HIGH"]),
+        (["ece15", "--sweep", "drag_area=0.4..0.6:few"], ["must be NAME=LOW..HIGH"]),
+        (["ece15", "--sweep", "drag_area=0.4..nan"], ["nan", "0.05 to 8 m²"]),
+        (["ece15", "--sweep", "drag_area=0.4..0.6:0"], ["0 steps"]),
         (["ece15", "--sweep", "battery.cells_parallel=1.5..4"], ["whole number"]),
         (["ece15", "--sweep", "drag_area=0.4..0.6:999"], ["999 steps"]),
         (["ece15", *(["--sweep", "drag_area=0.4..0.6"] * 2)], ["twice"]),
