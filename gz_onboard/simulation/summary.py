@@ -273,9 +273,11 @@ def _measured_rows(m: MeasuredEntry | None) -> list[tuple[str, str]]:
 
 def variants_text(sweep: Sequence[Variant]) -> str:
     """A table of the variants, for a terminal."""
-    lines = ["  ".join(f"{head:>10}" for head in (*sweep[0].values, "Wh/km", "range km", "shortfall s"))]
+    heads = [*sweep[0].values, "Wh/km", "range km", "shortfall s"]
+    rows = [heads]
     for v in sweep:
         results = number(v.consumption_wh_km, ".2f"), number(v.range_km, ".1f"), f"{v.shortfall_s:.0f}"
-        values = (f"{value:>{max(len(name), 10)}g}" for name, value in v.values.items())
-        lines.append("  ".join([*values, *(f"{result:>10}" for result in results)]))
+        rows.append([*(f"{value:g}" for value in v.values.values()), *results])
+    widths = [max(len(head), 10) for head in heads]
+    lines = ("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
     return "\n".join(lines)
