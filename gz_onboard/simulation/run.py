@@ -161,7 +161,7 @@ def drive(
     cutoff = battery.cutoff_voltage * battery.cells_series
     end = finish if finish is not None else float("inf")
     kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
-    rows, at = [(*states(scooter), nan)], [0]
+    cells = array("d", (*states(scooter), nan))  # row by row
     currents, voltages = array("d", (0.0,)), array("d", (0.0,))  # of the pack in each step
     done, empty, wanted = 0, False, nan
     for done in range(1, round(seconds / dt) + 1):
@@ -170,8 +170,7 @@ def drive(
         currents.append(scooter.current)
         voltages.append(scooter.voltage)
         if not done % row_every:
-            rows.append((*states(scooter), wanted))
-            at.append(done)
+            cells.extend((*states(scooter), wanted))
             if progress and not done % (100 * every):
                 progress(100 * every * dt)
         if scooter.distance >= end:
@@ -180,11 +179,13 @@ def drive(
             empty = True
             break
     if done % row_every:
-        rows.append((*states(scooter), wanted))
-        at.append(done)
+        cells.extend((*states(scooter), wanted))
     current, voltage = np.frombuffer(currents), np.frombuffer(voltages)
     energy = np.cumsum(current * voltage) * dt
-    columns = dict(zip((*_STATES, "wanted_speed"), np.array(rows, dtype=float).T, strict=True), energy=energy[at])
+    names = (*_STATES, "wanted_speed")
+    rows = np.frombuffer(cells).reshape(-1, len(names))
+    at = np.append(np.arange(0, done, row_every), done)
+    columns = dict(zip(names, rows.T, strict=True), energy=energy[at])
     steps = {name: columns[name] for name in COLUMNS}
     series = steps
     if keep_steps:

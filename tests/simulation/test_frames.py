@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections import Counter
 from functools import cache
 from math import atan, pi, sin
@@ -150,6 +151,17 @@ def test_lost_frames_show_in_the_counters_and_change_no_other():
         assert dropped[name] > 0
         assert abs(run.pipeline.codec.lost[name] - dropped[name]) <= 2  # at the ends no counter tells
     assert not {reason for _, reason in run.faults} - {NOT_AVAILABLE}
+
+
+def test_a_step_that_is_kept_takes_a_few_numbers():
+    scooter, seconds = Scooter(reference(), soc=0.8), 20.0
+    tracemalloc.start()
+    run = drive(scooter, along([10.0] * 500), seconds, keep_steps=True)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert run.steps
+    assert len(run.steps["time"]) == round(seconds / scooter.dt) + 1
+    assert most < 2 * 8 * len(run.steps) * seconds / scooter.dt  # bytes
 
 
 def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
