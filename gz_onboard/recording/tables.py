@@ -144,7 +144,7 @@ def _table(columns: Sequence[tuple[str, object]], name: str) -> SignalTable:
 
 
 def _cells(column: object, name: str, header: str) -> list[Any]:
-    """Return the cells of a column as Python objects. Raises InputError for anything else."""
+    """Return the cells of a column as Python objects. InputError for anything else, and for dates of no calendar."""
     kind = getattr(getattr(column, "dtype", None), "kind", "")
     array = np.array(0)
     with suppress(TypeError, ValueError):  # of rows of different lengths
@@ -154,6 +154,11 @@ def _cells(column: object, name: str, header: str) -> list[Any]:
     if array.dtype.kind in "Mm":
         array = array.astype(f"{array.dtype.kind}8[us]")  # as `datetime`, which has no ns
     cells: list[Any] = array.tolist()
+    if array.dtype.kind == "M":
+        for row, cell in enumerate(cells):
+            if isinstance(cell, int):  # in place of a `datetime`, which has the years 1 to 9999
+                time = array[row].astype("M8[s]")
+                raise InputError(f"{name}:{row + 1}: column {header!r}: {time} is not a plausible time")
     return cells
 
 

@@ -116,6 +116,16 @@ def test_a_cell_that_is_none_is_named_with_column_and_row(columns, said):
             currents(data)
 
 
+@pytest.mark.parametrize("as_table", [dict, pd.DataFrame, pa.table])
+@pytest.mark.parametrize("date", ["12000-01-01T00:00:00", "-044-03-15T00:00:00"])
+def test_a_date_of_no_calendar_is_named(as_table, date):
+    times = (np.arange(8) + SINCE_1970).astype("M8[s]")
+    times[5] = np.datetime64(date)
+    data = {"time": times, "pack_current [A]": AMPERES}
+    with pytest.raises(InputError, match=rf"table:6: column 'time': {date} is not a plausible time"):
+        currents(as_table(data))
+
+
 @pytest.mark.parametrize(
     "column", [pd.Series(SECONDS), pa.array(SECONDS), pa.chunked_array([SECONDS]), np.zeros((2, 2))]
 )
