@@ -46,6 +46,9 @@ class ConsumptionConfig:
     acceleration_limit: float = 15.0  # m/s²: no road gives more; a second that shows more is left out
     ride_ends_s: float = 600.0  # standstill after which another ride begins
     tyres_cool_s: float = 3600.0  # standstill after which tyres are cold
+    # Towing
+    driving_force: float = 0.003  # of the weight: a motor that takes less does not drive; tyres take thrice that
+    height_error_m: float = 3.0  # error of a climb that may explain how a vehicle moves without its motor
     # Filters
     fade_m: float = 50_000.0  # correlation length of a ride's deviation: 25 to 100 km err alike on 15 full discharges
     walk_per_sqrt_m: float = 2.2e-4  # random walk of the level: a tenth in 200 km (tyres, clothes, seasons)
@@ -227,6 +230,7 @@ class Second:
     distance: float = 0.0  # m, negative backwards
     unseen: float = 0.0  # m without a known grade
     energy: float = 0.0  # J
+    motor: float = 0.0  # J of it into the motor
     squares: float = 0.0  # W²·s
     climb: float = 0.0  # m
 
@@ -332,9 +336,11 @@ class ConsumptionLearner:
         modelled = any(p.name == "auxiliary_power" for effect in model.effects for p in effect.parameters)
         self.auxiliaries = AuxiliaryPower(model.parameters["auxiliary_power"] if modelled else 0.0)
         self.rider, self.other_riders = "", dict[str, Habits]()  # "": not known
-        self.distance = 0.0  # m ridden
+        self.distance = 0.0  # m ridden, without towed metres
         self.rides = 0  # that have ended
         self.still = 0.0  # s since the last motion
+        self.towed = False
+        self._coasted = self._unexplained = 0.0  # m without the motor, and J that nothing explains on them
         self._segment, self._second = Segment(), Second()
         self._history = deque[tuple[float, RidingState]](maxlen=CONSUMPTION.history_segments)
         self._weight = model.mass * GRAVITY  # N
@@ -395,13 +401,21 @@ class ConsumptionLearner:
     # --- learning -----------------------------------------------------------------------------------------------
 
     def ride(
-        self, dt: float, speed: float, grade: float | None, power: float, conditions: Conditions, period: float = 0.0
+        self,
+        dt: float,
+        speed: float,
+        grade: float | None,
+        power: float,
+        conditions: Conditions,
+        period: float = 0.0,
+        motor_power: float | None = None,
     ) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s], `grade` (sine) and `power` [W] of the pack.
 
-        period: of the speed's messages [s], as between two of them there is no acceleration.
+        period: of the speed's messages [s], as between two of them there is no acceleration; motor_power: into the
+        motor [W], None for all.
         """
-        self._gather(dt, speed, grade, power)
+        self._gather(dt, speed, grade, power, power if motor_power is None else motor_power)
         second, c = self._second, CONSUMPTION
         if second.seconds < max(1.0, period):
             return
@@ -417,6 +431,11 @@ class ConsumptionLearner:
         stored = self._weight * second.climb + self._moving_mass * (speed * speed - start * start) / 2
         auxiliary = self.auxiliaries.now * second.seconds
         measured = second.energy - auxiliary
+        if moving and grade is not None:
+            self._watch_towing(modelled - (repeated - stored + measured) / 2)
+            if self.towed:
+                self.pause()
+                return
         if self.load.ledger:
             self.load.ledger.measured += second.energy
         if moving:
@@ -445,20 +464,36 @@ class ConsumptionLearner:
         if self._segment.distance >= c.segment_m:
             self._close(conditions)
 
-    def _gather(self, dt: float, speed: float, grade: float | None, power: float) -> None:
+    def _gather(self, dt: float, speed: float, grade: float | None, power: float, motor: float) -> None:
         second, way = self._second, abs(speed) * dt
         if second.start_speed is None:
             second.start_speed = speed
         second.seconds += dt
         second.distance += speed * dt
         second.energy += power * dt
+        second.motor += motor * dt
         second.squares += power * power * dt
         if grade is None:
             second.unseen += way
         else:
             second.climb += grade * speed * dt
         self.load.time_moving += dt if speed > MOVING else 0.0
-        self.distance += way
+        self.distance += 0.0 if self.towed else way
+
+    def _watch_towing(self, unexplained: float) -> None:
+        """Unlearn the metres that something else has paid for: road and bus leave too much energy unexplained.
+
+        unexplained: of the second [J], modelled energy beyond half of a level road's and of the measured energy.
+        """
+        distance, limit = abs(self._second.distance), CONSUMPTION.height_error_m * self._weight
+        if self._second.motor > CONSUMPTION.driving_force * self._weight * distance:
+            self._unexplained = 0.0
+        else:
+            self._unexplained = min(max(self._unexplained + unexplained, 0.0), 2 * limit)
+        self._coasted = self._coasted + distance if self._unexplained else 0.0
+        before, self.towed = self.towed, self._unexplained > limit
+        if self.towed and not before:
+            self._revert(self._coasted)
 
     def _close(self, conditions: Conditions) -> None:
         """Learn from the segment that has ended."""
@@ -487,15 +522,19 @@ class ConsumptionLearner:
         )
         self._segment = Segment()
 
-    def forget(self, distance: float) -> None:
-        """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
-        seen = self.state.habits
-        self.pause()
+    def _revert(self, distance: float) -> None:
+        """Go back to the state before the last `distance` [m] or a little more, as far as it is known."""
         distance -= self._segment.distance
         self._segment = Segment()
         while distance > 0 and self._history:
             way, self.state = self._history.pop()
             distance -= way
+
+    def forget(self, distance: float) -> None:
+        """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
+        seen = self.state.habits
+        self.pause()
+        self._revert(distance)
         doubted = (mine.doubted(its.now) for mine, its in zip(self.state.habits, seen, strict=True))
         self.state = self.state._replace(habits=Habits(*doubted))
 

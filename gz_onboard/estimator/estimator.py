@@ -27,7 +27,7 @@ from gz_onboard.estimator.plausibility.residual import LimitCheck
 from gz_onboard.estimator.route import RouteForecaster
 from gz_onboard.estimator.saved_state import VERSION, Each, Number, Text, check, check_vehicle
 from gz_onboard.estimator.signals import TIMING, Signals
-from gz_onboard.events import LOADS, NO_PACK, SPEEDS, Activity, Estimate, Group, MessageWindow, Reason, State
+from gz_onboard.events import LOADS, NO_PACK, SPEEDS, WINDOW, Activity, Estimate, Group, MessageWindow, Reason, State
 from gz_onboard.model.battery import Battery
 from gz_onboard.model.effect import MOVING
 from gz_onboard.model.model import Model
@@ -38,6 +38,8 @@ STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be e
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
 LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
 AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
+LEAP = 30.0  # s: the odometer shows whether a longer step of time was a gap, or the clock was set
+ODOMETER_WITHIN = 3.0  # s to wait for the odometer after such a step
 CELLS_KEEP = 3600.0  # s: saved cell temperatures that are older say nothing
 NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
 LOSS_SD = {  # relative, of the consumption to come for what is missing, from the errors on the rides without each
@@ -80,6 +82,9 @@ class Estimator:
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None  # only where it is read
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
+        self._odometer: float | None = None  # m, at the last step
+        self._odometer_step = 0.0  # m, the largest of its counts; 0: it has not counted yet
+        self._clock_leap: float | None = None  # s: the first step after a gap that waits for the odometer
         self._activity, self._reading = ActivityTracker(), PackReading()
         self._distrusted: tuple[str, ...] = ()
         self.limits = LimitCheck(self.signals)
@@ -107,7 +112,9 @@ class Estimator:
         now = max(self._time or 0.0, *(window.time for window in windows))
         signals, motion = self.signals, self.motion
         signals.take(windows, now)
-        dt = 0.0 if self._time is None else now - self._time
+        dt = self._time_passed(now)
+        if dt is None:
+            return
         self._time = now
         elapsed = min(dt, signals.pause)
         self.gap_time += dt - elapsed
@@ -127,6 +134,29 @@ class Estimator:
             self.forecaster.outdate()
         elif self.forecaster.due(now):
             self._look_ahead(now, temperature)
+
+    def _time_passed(self, now: float) -> float | None:
+        """Measure the time since the last step [s] without leaps of the clock; None while it cannot be told yet.
+
+        A gap during which the odometer did not move, although the vehicle moved before and after it, is a leap of the
+        clock. The step waits until the odometer has come. Also updates the motion to the speed behind the gap.
+        """
+        dt = 0.0 if self._time is None else now - self._time
+        odometer, speed = self.signals.odometer, self.motion.speed or 0.0
+        moved = 0.0 if self._odometer is None else odometer.value - self._odometer
+        if dt > LEAP and self._odometer_step and speed > MOVING:
+            self._clock_leap = self._clock_leap or now
+            came = odometer.time >= self._clock_leap - WINDOW
+            if not came and now - self._clock_leap < ODOMETER_WITHIN:
+                return None
+            self.motion.step(now, 0.0)  # how fast it is now
+            least = min(speed, self.motion.speed or 0.0) * dt / 2
+            if came and 0 <= moved + self._odometer_step < least:
+                dt, moved = max(now - self._clock_leap, WINDOW), 0.0
+        elif 0 < moved < UNLEARNED:
+            self._odometer_step = max(self._odometer_step, moved)
+        self._clock_leap, self._odometer = None, odometer.last
+        return dt
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """Read voltage and current of the pack by the sensors, else by the model."""
@@ -154,7 +184,8 @@ class Estimator:
         """Compare the sensors of the grade; forget everything learned from a sensor that is newly distrusted."""
         grades, reading = self.grades, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
-        power = None if voltage is None or current is None or modelled else voltage * current
+        towed = self.forecaster.learner.towed  # then no energy of the bus shows a grade
+        power = None if voltage is None or current is None or modelled or towed else voltage * current
         grades.compare(now, dt, gap, power)
         left_out = self._distrusted
         self._distrusted = tuple([sensor.role for sensor in self._checked if sensor.faulty])
@@ -204,8 +235,26 @@ class Estimator:
             return
         power = reading.voltage * reading.current
         self.route.ride(dt, speed, power)
-        period = next((self.signals[role].period for role in self.signals.mapped(SPEEDS)), 0.0)
-        self.forecaster.learner.ride(dt, speed, self.motion.grade, power, self.load.conditions(now), period)
+        self.forecaster.learner.ride(
+            dt,
+            speed,
+            self.motion.grade,
+            power,
+            self.load.conditions(now),
+            next((self.signals[role].period for role in self.signals.mapped(SPEEDS)), 0.0),
+            self._drive(now, reading.voltage, power),
+        )
+
+    def _drive(self, now: float, voltage: float, power: float) -> float:
+        """Return the motor's part [W] of the `power` of the pack at `voltage` [V]."""
+        signals = self.signals
+        current, torque = signals.inverter_current.get(now), signals.motor_torque.get(now)
+        if current is not None:
+            return voltage * current
+        if torque is not None and (turning := signals.motor_speed.get(now)) is not None:
+            return torque * turning
+        auxiliaries = self.forecaster.learner.auxiliaries
+        return power - auxiliaries.modelled - auxiliaries.now
 
     def _look_ahead(self, now: float, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)

@@ -19,7 +19,7 @@ says.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from math import cos, inf, pi, radians, sqrt
+from math import cos, exp, inf, pi, radians, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gz_onboard.constants import DECILE, METRES_PER_DEGREE
@@ -53,6 +53,11 @@ class RouteConfig:
     longitudinal: float = 5.0  # a metre along the route counts so much less than one across
     gain: float = 0.3  # share of the difference along the route that one fix corrects
     against: float = 2.0  # rad between the course and the route's heading: ridden the other way
+    compared: float = 1500.0  # over which heights are compared: a receiver's altitude drifts by some metres on it
+    min_compared: float = 700.0  # of that, before which nothing is said
+    heights_apart: float = 0.02  # of the way: differing by more they are of two roads
+    heights_alike: float = 0.01  # by less of one again
+    step: float = 100.0  # longer ones, or farther from the distance ridden: along the route it was placed elsewhere
 
     # Cost
     segment_m: float = 250.0  # of the route from which the cost is learned
@@ -157,6 +162,36 @@ class RoutePosition:
         return self._distance[some][:-1] + share * length, off, turned
 
 
+class HeightCheck:
+    """Whether the hills of a route are those ridden: a file of another road, or in feet, has others.
+
+    Compares the height that the route gains with that which the vehicle gains on it, over the latest kilometre or so.
+    """
+
+    def __init__(self) -> None:
+        self.contradicts = False
+        self._before: tuple[float, float] | None = None  # m along the route, m of altitude
+        self._way = self._apart = 0.0  # m, fading
+
+    def update(self, along: float, ridden: float, climb: float, altitude: float | None) -> None:
+        """The vehicle is at `along` [m] of the route, `ridden` [m] since the last update.
+
+        climb: that the route gains between the two [m]; altitude: measured [m], None if it is not known.
+        """
+        config, before = CONFIG, self._before
+        self._before = None if altitude is None else (along, altitude)
+        if before is None or altitude is None:
+            return
+        way, gained = along - before[0], altitude - before[1]
+        if not 0 < way < config.step or abs(way - ridden) > config.step or abs(gained) > way:
+            return
+        kept = exp(-way / config.compared)
+        self._way, self._apart = kept * self._way + way, kept * self._apart + climb - gained
+        if self._way > config.min_compared:
+            limit = config.heights_alike if self.contradicts else config.heights_apart
+            self.contradicts = abs(self._apart) > limit * self._way
+
+
 class RouteCosts(NamedTuple):
     """Modelled energies from the start of the route to each of its points [J], shape (n,)."""
 
@@ -168,7 +203,8 @@ class RouteCosts(NamedTuple):
 class PreparedRoute:
     """A route cut into pieces, with where the vehicle is on it.
 
-    `distance` [m] of the ends of the pieces, `speed` [m/s] that limits and bends allow there; shape (n,).
+    `distance` [m] of the ends of the pieces, `speed` [m/s] that limits and bends allow there, `climb` [m] from the
+    start; shape (n,).
     """
 
     def __init__(self, route: Route, top_speed: float) -> None:
@@ -183,6 +219,7 @@ class PreparedRoute:
         known |= {"headwind": route.headwind or (0.0,) * len(route.distance)}
         self._pieces = {name: np.interp(middles, route.distance, values) for name, values in known.items()}
         self.length = float(self.distance[-1])  # m
+        self.climb = np.concatenate(([0.0], np.cumsum(self._pieces["grade"] * np.diff(self.distance))))
         self._stops = np.zeros(len(middles))  # s
         if route.stop:
             ends = np.searchsorted(self.distance, np.array(route.distance))
@@ -264,6 +301,7 @@ class RouteForecaster:
         self._segment: tuple[float, float] | None = None  # where it began: m along the route, m/s
         self._energy = self._ridden = 0.0  # J, m: of the segment
         self._distance = 0.0  # m of the vehicle at the last forecast
+        self._heights = HeightCheck()
 
     def prepare(self, route: Route) -> PreparedRoute:
         """Make `route` ready, in any thread. Without limits the fastest speed of the prior riding is the limit."""
@@ -272,14 +310,14 @@ class RouteForecaster:
     def follow(self, route: PreparedRoute | None) -> None:
         """Have `route` from now on, or none."""
         self._route, self.costs, self._segment = route, None, None
-        self._distance = self._motion.distance
+        self._distance, self._heights = self._motion.distance, HeightCheck()
         self._forecaster.smoother.show_next()
         self.outlook = Estimate(0.0, route_state=RouteState.OFF if route else RouteState.NONE)
         self.hills = 0.0, 0.0
 
     def ride(self, dt: float, speed: float, power: float) -> None:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
-        if self._segment:
+        if self._segment and not self._forecaster.learner.towed:
             self._ridden += abs(speed) * dt
             self._energy += (power - self._forecaster.learner.auxiliaries.now) * dt
 
@@ -295,7 +333,7 @@ class RouteForecaster:
         if route is None:
             return free
         self._move(now, route)
-        on = route.position.on
+        on = route.position.on and not self._heights.contradicts
         if on is not (self.outlook.route_state is RouteState.ON):  # the display has another basis now
             self._forecaster.smoother.show_next(on_route=on)
         if not on:
@@ -320,7 +358,7 @@ class RouteForecaster:
         return {name: getattr(self.outlook, name) for name in REPORTED} if self._route else {}
 
     def _move(self, now: float, route: PreparedRoute) -> None:
-        signals, motion = self._signals, self._motion
+        signals, motion, before = self._signals, self._motion, route.position.along
         moved, self._distance = motion.distance - self._distance, motion.distance
         latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
         fix = None
@@ -328,6 +366,9 @@ class RouteForecaster:
             fix = latitude, longitude
         course = motion.heading if (motion.speed or 0.0) > CONFIG.min_course_speed else None
         route.position.update(moved, fix, course)
+        if route.route.grade_known and route.position.on:
+            here = route.position.along
+            self._heights.update(here, moved, route.between(route.climb, before, here), motion.altitude)
 
     def _learn(self, route: PreparedRoute, costs: RouteCosts) -> None:
         """Learn the cost if a segment ends here, by a scalar Kalman filter."""

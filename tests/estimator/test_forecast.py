@@ -92,6 +92,31 @@ def test_a_climb_is_not_taken_for_consumption():
     assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
 
 
+def roll(f, kilometres, grade, seed=0, drift=0.0, drive=0.0):
+    """Roll at 8 m/s with the motor off, or as if with `drive` [W]; `drift`: sd of the error of the grade shown."""
+    rng, error = np.random.default_rng(seed), 0.0
+    for i in range(round(kilometres * 1000 / 0.8)):
+        if i % 600 == 0:  # for half a kilometre
+            error = drift * rng.standard_normal()
+        f.learner.ride(0.1, 8.0, grade + error, 45.0, AIR, motor_power=drive)
+
+
+@pytest.mark.parametrize("tows", [1, 3])
+def test_metres_that_something_else_paid_for_teach_nothing(tows):
+    f, never_towed = forecaster(), forecaster()
+    for each in f, never_towed:
+        ride(each, 8)
+    for _ in range(tows):
+        roll(f, 3, grade=0.0)
+        for each in f, never_towed:
+            ride(each, 2, seed=1)
+    towed, usual = forecast(f), forecast(never_towed)
+    assert towed.range == pytest.approx(usual.range, rel=0.01)
+    assert towed.p10 == pytest.approx(usual.p10, rel=0.02)
+    assert towed.p90 == pytest.approx(usual.p90, rel=0.02)
+    assert f.learner.factor == pytest.approx(never_towed.learner.factor, rel=0.01)
+
+
 def test_empty_is_zero_with_an_upper_bound():
     result = forecast(forecaster(), soc=0.0)
     assert result.range == 0.0

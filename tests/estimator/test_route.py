@@ -173,6 +173,18 @@ def test_off_the_route_it_is_as_without_one_and_comes_back():
     assert rider.forecast.outlook.route_along == pytest.approx(890, abs=5)
 
 
+@pytest.mark.parametrize("slope", [-0.05, 0.05])
+def test_a_route_with_other_hills_than_are_ridden_is_left_and_taken_up_again(slope):
+    """Heights of another road: for a kilometre it is believed, then the range is that without it."""
+    rider, states = Rider(way(20e3, grade=lambda x: slope if x < 6e3 else 0.0)), []
+    rider.settled()
+    for seconds, ridden in ((60, 0.0), (60, 0.0), (900, None)):
+        rider.ride(seconds, 1000.0, slope=ridden)
+        states.append(rider.forecast.outlook.route_state)
+        assert (rider.ask() is FREE) == (states[-1] == RouteState.OFF)
+    assert states == [RouteState.ON, RouteState.OFF, RouteState.ON]
+
+
 def test_an_empty_battery_has_no_range():
     found, answer = Rider(way(5e3)).settled(FREE._replace(left=Drawable(0.0, 6e6, 0.02), energy_sd=3e4), soc=0.02)
     assert found.range == found.p10 == 0.0 < found.p90 < 2e3

@@ -19,6 +19,7 @@ from gz_onboard.estimator.plausibility.residual import (
     Sensor,
     SlowSensor,
     explain,
+    share_of_new,
 )
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import SPEEDS
@@ -76,6 +77,7 @@ class SpeedCheck:
         self.sensors = {role: Sensor(role, signals[role]) for role in signals.mapped((*SPEEDS, "odometer"))}
         self._speeds = [self.sensors[role] for role in signals.mapped(SPEEDS)]
         self.odometer = OdometerTest(signals)
+        self._drift = dict.fromkeys(SPEEDS, 0.0)  # m/s, mean difference from the median
         self._spinning = 0.0  # s in which driven axle and moving ground contradict each other
         self._rest = CONFIG.short_s  # s, the last of it before the GPS began to move
         self.median: float | None = None  # m/s, of the sensors of
@@ -120,7 +122,9 @@ class SpeedCheck:
         moving = middle > CONFIG.moving_m_s
         outvoted, tied = vote(speeds, tolerance, spins=False)
         if not outvoted | tied:
-            self._spinning = max(self._spinning - dt, 0.0) if moving else self._spinning
+            if moving:
+                self._spinning = max(self._spinning - dt, 0.0)
+                outvoted = self._drifting(dt, speeds, middle)
         elif not any(vote(speeds, tolerance)):  # the driven axle against the ground
             moving = min(speeds.values()) > CONFIG.moving_m_s  # else on a roller bench
             self._spinning = min(self._spinning + dt, 1.5 * CONFIG.wheelspin_s) if moving else self._spinning
@@ -140,6 +144,16 @@ class SpeedCheck:
             comparable = middle > CONFIG.moving_m_s and sensor.unchanged < stuck_s
             against = role in outvoted or role in tied
             sensor.judge(dt, True if against else False if comparable else None, role in tied)
+
+    def _drifting(self, dt: float, speeds: Mapping[str, float], middle: float) -> frozenset[str]:
+        """Roles that differ from the median in the mean; it takes three speeds to say which."""
+        if len(speeds) < 3:
+            return NO_SENSOR
+        drift, share = self._drift, share_of_new(dt, CONFIG.settled_s)
+        for role, speed in speeds.items():
+            drift[role] += share * (speed - middle - drift[role])
+        usual = CONFIG.agreeing_residual * (CONFIG.speed_sd_m_s + CONFIG.speed_sd_relative * middle)
+        return frozenset([role for role in speeds if abs(drift[role]) > usual])
 
     def _test_single(self, dt: float, speeds: Mapping[str, float], gap: bool) -> None:
         """Compare the only speed with the odometer, which is no witness among others: it is often made from one."""
