@@ -53,9 +53,11 @@ class PackConfig:
     longest_wait_s: float = 60.0  # then the filter starts with whatever there is, knowing nothing
     steady_sd: float = 4.0  # of the movement: how much may be to come
     slow_signals_s: float = 1.5  # wait for signals that come once a second
+    rejected_signals_s: float = 5.0  # wait for signals that come, but cannot be right yet
     possible: float = 0.5  # of the span of the rest voltage: no cell at work is further beyond full or empty
     drop_factor: float = 3.0  # of the drop by the tables: no cell has more, cold and aged ones included
     joined_s: float = 900.0  # how long ago a ride began that is joined under way
+    doubted_start_s: float = 30.0  # a voltage that is doubted so soon has misled the first state
     # Steps
     zero_s: float = 60.0  # a current that reads exactly 0 for longer may be any small one
     near: float = 0.01  # of SOC: over so little the curve is straight
@@ -194,7 +196,9 @@ class BatteryPack:
         self._looked = -inf  # s: when a first voltage was looked at last,
         self._waiting_since = inf  # s: and at first
         self._was_unsteady = False
-        self._joined = False
+        self._started = -inf  # s
+        self._started_from: tuple[FilterState, Past | None, float | None] = self.state, None, None
+        self._joined = self._was_doubted = False
         self._restarted_at = -inf  # s
         self._gap: tuple[float, FilterState, Past] | None = None  # when the pack was measured last, and the state then
         self._voltage_time: float | None = None  # s, of the message whose voltage was used last
@@ -270,6 +274,10 @@ class BatteryPack:
         temperature: of the cells [degC]; speed in m/s; inputs: of effects in the cells, apart from those of the cells
         themselves; prior_power: of the prior riding [W] at a time [s]; price: the consumption expected [J/m].
         """
+        if reading.voltage_doubted and not self._was_doubted and now - self._started < PACK.doubted_start_s:
+            self.state, past, age = self._started_from  # the voltage has misled the filter
+            self._wait(past, age)
+        self._was_doubted = reading.voltage_doubted
         self._follow_gap(now, dt, reading, temperature, price)
         voltage, current = reading.voltage, reading.current
         if voltage is not None:
@@ -554,6 +562,8 @@ class BatteryPack:
             awaited += [signals.odometer, signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
         least = PACK.slow_signals_s if missing else PACK.steady_s
+        if self.past and signals.has_rejected:
+            least = PACK.rejected_signals_s
         if now - first.time < (PACK.resettled_s if self._was_unsteady else least) and not is_late:
             return
         self._waiting_since, self._was_unsteady = inf, False
@@ -563,6 +573,7 @@ class BatteryPack:
     def _start(self, now: float, first: First, reading: PackReading, temperature: float, power: float) -> None:
         """Start from the `first` voltage and the state that was believed; power: of the prior riding [W]."""
         battery, effects, past = self.battery, self.effects, self.past
+        self._started, self._started_from = now, (self.state, past, self.past_age)
         self._joined = bool(first.moving) and not past
         if self._unseen:
             drawn = first.current

@@ -294,6 +294,10 @@ def first_state(
     slow_sd = hypot(noise.rest, first.voltage_sd, noise.loaded(rough, temperature) if loaded else 0.0)
     once_sd = hypot(noise.resistance * (r0 * current + first.overpotential), first.unsteady_sd)
     if past and age is not None:
+        if not loaded and past.odometer is not None and past.own_soc is not None and now.own_soc is not None:
+            is_charged = abs(now.own_soc - past.own_soc) > PRIOR.own_soc_sd
+            if past.odometer == now.odometer and not is_charged:  # the vehicle was not used
+                v1_sd *= exp(-age / PRIOR.relaxation_s)
         if age < PRIOR.relaxed_s:
             decay = exp(-age / (r1 * c1))
             v1 += (believed.v1 - v1) * decay

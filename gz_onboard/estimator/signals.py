@@ -229,6 +229,11 @@ class Signals:
         if self.sampled <= TIMING.slowest:
             self.pause = max(TIMING.pause, TIMING.pause_periods * self.sampled)
 
+    @property
+    def has_rejected(self) -> bool:
+        """Whether the last self-reported value of any role was rejected."""
+        return any(signal.accepted and signal.rejected for signal in self.self_reported.values())
+
     def resume(self, values: Mapping[str, float | None]) -> None:
         """Continue from the values that the vehicle reported before, by role."""
         for role, value in values.items():

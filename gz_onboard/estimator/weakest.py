@@ -58,6 +58,7 @@ class WeakestConfig:
     gate: float = 5.0  # sd: a block that is further off is left out
     misfit_sd: float = 0.0007  # of SOC: what such a block adds to what is not known
     walk_sd: float = 0.0005  # of SOC: change of the charge over a block, by leaks, balancing and errors of the curve
+    past_empty: float = 0.02  # of SOC, and two sd: a group believed to be emptier while charge flows is no group
     doubt_gain: float = 0.15  # share of the next block in the doubt
     refused_from: float = 0.5  # doubt
     trusted_below: float = 0.02  # doubt
@@ -225,6 +226,10 @@ class WeakestGroup:
         self.refused = self.refused and self._doubt > CONFIG.trusted_below
         if learned and not self.refused:
             self.known = learned
+        behind, sd = self.known.behind(1 - soc)
+        if self.known.blocks >= CONFIG.proven and soc - behind + 2 * sd < -CONFIG.past_empty:
+            self.forget()
+            self.refused, self._doubt = True, 1.0
         if self._doubt < CONFIG.trusted_below:
             self._undoubted = self.known
         self.group = self._used()

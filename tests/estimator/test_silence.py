@@ -165,3 +165,12 @@ def test_a_precharge_accuses_nobody(begin, time_constant):
     rows = follow(e, precharged(scooter.live(15)), scooter) + follow(e, scooter.live(100, 10.0), scooter)
     assert {role for _, row in rows for role in row.distrusted} == set()
     assert worst(rows) < 3
+
+
+@pytest.mark.parametrize("volts", [-2.0, 2.0])
+def test_a_start_on_a_voltage_that_lies_is_made_again(volts):
+    scooter, e = Scooter(soc=0.6), estimator()
+    spoilt = ((t, g, (v[0] + volts, *v[1:]) if g == PACK else v) for t, g, v in scooter.live(300, 10.0))
+    rows = follow(e, spoilt, scooter)
+    assert worst(rows[20:]) < 3
+    assert "pack_voltage" in rows[-1][1].distrusted

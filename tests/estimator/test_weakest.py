@@ -218,3 +218,13 @@ def test_a_pack_delivers_until_its_weakest_group_ends():
     assert 0 < whole.energy - harder.energy < 0.02 * whole.slope
     alike = drawable(pack_with(WeakGroup(0.0, 0.0, 0.0)), 0.5, 18.0, 700.0)
     assert alike.energy == pytest.approx(whole.energy, rel=2e-3)
+
+
+def test_a_group_that_would_long_be_empty_is_none():
+    """A signal 0.15 V too low from the start looks like a weak group, until the pack goes on without it."""
+    deceived, later = (ridden(Hidden(), until, lambda t, v: v - 0.15) for until in (0.3, 0.12))
+    assert not deceived.pack.weakest.refused
+    assert left(deceived, deceived.pack.weakest.group) < 0.5 * left(deceived, None)
+    assert later.pack.weakest.refused
+    assert later.pack.weakest.group is None
+    assert left(later, later.pack.battery.health.weakest) == pytest.approx(left(later, None))
