@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 
 FARTHEST = 1e30  # of a limit of a signal; some editors write out those of its type
 LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
-_VALUE_NAMES = re.compile(r'^[ \t]*VAL_ (?:[^;"\n]|"[^"\n]*")*;', re.M)
+_VALUE_NAMES = re.compile(
+    r"""^[ \t]* VAL_ \s (?:
+        [^;"\n] | \n (?= \s* [-\d";] )  # numbers, also on the next line
+        | " (?: \\. | [^"\\\n] | \n (?! [ \t]* [A-Z_]+_\b ) )* "  # a text that ends before the next statement
+    )* ;""",
+    re.M | re.X,
+)
 """They are of no use for reading, and cantools refuses those of signals that are not there."""
 _WIDE = re.compile(r"\b((?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)\s+)(\d{4,9})\b")
 _MESSAGE_NUMBER = re.compile(r"^[ \t]*BO_[ \t]+(\d{4,9})\b", re.M)
@@ -116,7 +122,7 @@ class _DbcFile:
     def __init__(self, name: Path, text: str, left_out: LeftOut | None) -> None:
         self.name = name
         if left_out is not None:
-            text = _VALUE_NAMES.sub("", text)
+            text = _VALUE_NAMES.sub(lambda found: "\n" * found[0].count("\n"), text)  # lines keep their numbers
         self._lines = _completed(name, text).split("\n")
         self._left_out = left_out
         self._said: dict[str, None] = {}  # each problem once, with its line

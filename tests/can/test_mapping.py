@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.can.dbc import find_dbc, load_database
+from gz_onboard.can.dbc import _VALUE_NAMES, find_dbc, load_database
 from gz_onboard.can.mapping import BusMapping, read_mapping, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.toml import Table
@@ -317,10 +317,24 @@ def test_what_cantools_refuses_is_left_out_and_said_once(tmp_path, caplog, chang
 SIGNALS = {"Pack": ["Voltage", "Current", "State", "Counter", "Sum"], "Motor": ["Speed", "State", "Heat"]}
 
 
-def test_names_of_values_of_a_signal_that_is_not_there_do_no_harm(tmp_path, caplog):
-    text = DBC.replace("BA_DEF_ BO_", 'VAL_ 256 Charge 0 "a; b" 1 "b" ;\nBA_DEF_ BO_', 1)
+@pytest.mark.parametrize(
+    "names",
+    [
+        ' 256 Charge 0 "a; b" 1 "b" ;',
+        ' 256 Charge 0 "a"\n 1 "b" ;',
+        r' 256 Charge 0 "\"a\"" ;',
+        '\t256 Charge 0 "a\nb";',
+    ],
+)
+def test_names_of_values_of_a_signal_that_is_not_there_do_no_harm(tmp_path, caplog, names):
+    text = DBC.replace("BA_DEF_ BO_", f"VAL_{names}\nBA_DEF_ BO_", 1)
     assert len(mapping(tmp_path, dbc=text).database.messages) == 2
     assert not caplog.records
+
+
+@pytest.mark.parametrize("names", ['VAL_ 256 State 0 "a"', 'VAL_ 256 State 0 "a ;'])
+def test_names_of_values_without_an_end_take_no_message_along(names):
+    assert not _VALUE_NAMES.search(f'{names}\n\nBO_ 300 Late: 1 X\n SG_ Last : 0|8@1+ (1,0) [0|1] "V" X\n\nCM_ "c" ;\n')
 
 
 def test_a_dbc_without_its_bs_line_is_read(tmp_path, caplog):
