@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.recording.logs import read_frames
 from gz_onboard.recording.readers.contents import LogDamage
+from gz_onboard.recording.readers.text import read_candump
 
 MS = 1_000_000
 S = 1000 * MS
@@ -80,6 +82,12 @@ def test_candump_as_on_the_screen(tmp_path):
         (at + 4 * MS, 4 | ERR_FLAG, bytes.fromhex("0004000000000000"), 0),
         (at + 5 * MS, 0x100, b"", 0),
     ]
+
+
+def test_junk_behind_a_long_text_without_frames_is_no_empty_log():
+    text = b"\texplains an error frame\n" * 10_000 + b"junk\n"
+    with pytest.raises(InputError, match=r"ride, line 10001: cannot be read as a candump log"):
+        read_candump(text, LogDamage(Path("ride")))
 
 
 def test_candump_times_since_the_start_and_since_the_frame_before(tmp_path, caplog):

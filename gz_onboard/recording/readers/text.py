@@ -50,7 +50,8 @@ def read_lines(data: Contents, damage: LogDamage, parse: Parser, name: str) -> F
                 damage.add(f"line {number}", f"{error}: {shown(line.strip()[:60])}")
         if damage.count and not frames and not parts:
             raise InputError(f"{damage.path}, {damage.place}: cannot be read as {name}: {damage.reason}")
-        parts.append(FrameColumns.of(frames))
+        if frames:
+            parts.append(FrameColumns.of(frames))
     return timed(FrameColumns.concatenate(parts), damage)
 
 
