@@ -259,6 +259,43 @@ def test_rubbish_in_the_middle_loses_what_it_hits_and_is_told(suffix: str, place
         assert len(there) >= 13_000  # two chunks at most
 
 
+def blf_of(path: Path, *contents: bytes) -> Path:
+    """Write a BLF file with a container for each of the contents, not packed."""
+    path.write_bytes(struct.pack("<4sL8B2Q2L8H8H72x", b"LOGG", 144, *[0] * 28))
+    with path.open("ab") as file:
+        for content in contents:
+            file.write(struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(content), 10, 0, len(content)))
+            file.write(content + bytes(len(content) % 4))
+    return path
+
+
+def blf_object(number: int, data: bytes = bytes(8)) -> bytes:
+    return struct.pack("<4sHHLLLHHQHBBL8s", b"LOBJ", 32, 1, 48, 1, 2, 0, 0, number, 1, 0, 8, number, data)
+
+
+def identifiers(path: Path) -> tuple[list[int], list[tuple[int, str]]]:
+    frames, damages = read(path)
+    return [frame[1] for frame in frames], [(damage.count, damage.reason) for damage in damages]
+
+
+_NO_OBJECT = "no object where one should begin in this container"
+
+
+def test_what_is_next_to_damage_in_a_blf_is_read(tmp_path: Path) -> None:
+    made = [blf_object(i) for i in range(100)]
+    path = blf_of(tmp_path / "a.blf", b"".join([*made[:50], b"JUNK" + made[50][4:], *made[51:]]))
+    assert identifiers(path) == ([i for i in range(100) if i != 50], [(1, _NO_OBJECT)])
+    path = blf_of(tmp_path / "b.blf", b"".join(made) + bytes(20))
+    assert identifiers(path) == (list(range(100)), [(1, _NO_OBJECT)])
+
+
+@pytest.mark.parametrize("cut", range(1, 48))
+def test_a_blf_object_may_be_split_anywhere_also_if_data_spell_its_signature(tmp_path: Path, cut: int) -> None:
+    made = b"".join(blf_object(i, b"LOBJ\x20\0\1\0") + bytes(3) for i in range(4))
+    at = 2 * (48 + 3) - 3 + cut
+    assert identifiers(blf_of(tmp_path / "a.blf", made[:at], made[at:])) == ([0, 1, 2, 3], [])
+
+
 def test_broken_lines_are_skipped_counted_and_the_first_one_named(tmp_path: Path) -> None:
     frames = ordinary(3000)
     path = written(tmp_path, frames, ".log")

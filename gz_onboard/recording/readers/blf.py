@@ -133,7 +133,15 @@ def _starts(content: bytes, damage: LogDamage, place: str) -> tuple[NDArray[np.i
     ends = starts + sizes
     nexts = np.append(starts, len(content))
     gaps = nexts[np.searchsorted(nexts[:-1], ends)] - ends
-    is_whole = (sizes >= _HEAD.size) & (gaps >= 0) & (gaps <= _MOST_PADDING)  # data may spell the signature too
+    is_plausible = (sizes >= _HEAD.size) & (gaps >= 0)
+    is_whole = is_plausible & (gaps <= _MOST_PADDING)  # data may spell the signature too
+    # With damage behind; if less is behind, it may be padding and the first letters of a signature.
+    before_damage = is_plausible & (gaps >= _MOST_PADDING + len(_SIGNATURE))
+    if before_damage.any():  # those that overlap no whole object are whole
+        begins, reach = starts[is_whole], np.append(0, np.maximum.accumulate(ends[is_whole]))
+        before = np.searchsorted(begins, starts)
+        is_apart = (before == np.searchsorted(begins, ends)) & (reach[before] <= starts)
+        is_whole |= before_damage & is_apart
     ends = np.append(0, ends[is_whole])
     begin_of_rest = int(nexts[np.searchsorted(nexts, ends[-1])])
     if (np.append(starts[is_whole], begin_of_rest) - ends > _MOST_PADDING).any():
