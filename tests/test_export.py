@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import cantools
+import pyarrow.parquet
 import pytest
 from mcap.reader import make_reader
 
+import gz_onboard as gz
 from gz_onboard import cli
 from gz_onboard.can.codec import Codec
 from gz_onboard.can.logfile import LogFile, object_schema
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
 from gz_onboard.export import command
+from gz_onboard.export.contents import ExportSource
 from gz_onboard.export.decoder import Decoder, column_name
 from gz_onboard.recording.frames import FrameColumns
 from gz_onboard.recording.logs import read_frames, read_samples
@@ -297,6 +300,32 @@ def test_signals_as_lines_of_json(tmp_path: Path, log: Path, name: str) -> None:
     assert f'{{"time[s]": {START // 10**9}.000000000, ' in text_of(
         tmp_path / name
     )  # to the nanosecond, which no float has
+
+
+def test_a_signal_called_time_takes_no_place_of_the_times(tmp_path: Path) -> None:
+    path = tmp_path / "ride.mcap"
+    file = LogFile(path.open("wb"), START, {}, {"dbc/a.dbc": DBC.replace("Mode", "time").encode()})
+    file.frames([(START + i, 256, bytes([0, 0, 0, 0, i, 60, 0, 0]), 0) for i in range(3)])
+    file.close()
+    signals = gz.read_signals(path)
+    table = signals.messages["Pack"].to_table()
+    assert table["time"].astype("int64").tolist() == [START, START + 1, START + 2]
+    assert table["time_signal"].tolist() == [0, 1, 2]
+    assert run(path, tmp_path / "tables", "--table-format", "parquet") == 0
+    written = pyarrow.parquet.read_table(tmp_path / "tables" / "Pack.parquet")
+    assert written.column_names == list(table)
+    assert written["time_signal"].to_pylist() == [0, 1, 2]
+    rows = signals.to_table()
+    assert rows["value"][rows["signal"] == "time"].tolist() == [0, 1, 2]
+    assert rows["time"].astype("int64").tolist() == [START + i // 4 for i in range(12)]
+
+
+def test_damage_of_a_log_of_estimates_is_told_once(estimated: Path) -> None:
+    estimated.write_bytes(estimated.read_bytes()[:-40])
+    source = ExportSource(estimated)
+    assert not source.has_frames
+    assert source.samples
+    assert len(source.damages) == 1
 
 
 def test_frames_as_a_table(tmp_path: Path, log: Path) -> None:

@@ -28,6 +28,7 @@ from gz_onboard.reports.tables import (
     Columns,
     Tabular,
     array_of,
+    beside_time,
     json_line,
     open_text,
     table_columns,
@@ -61,7 +62,8 @@ class LoggedMessage(Tabular):
 
     def to_table(self) -> Columns:
         """Return a row for each frame, as in a folder of tables that ``gz-onboard export`` writes."""
-        return {"time": time_array(self.times), **{name: array_of(column) for name, column in self.columns.items()}}
+        columns = {beside_time(name): array_of(column) for name, column in self.columns.items()}
+        return {"time": time_array(self.times), **columns}
 
 
 @dataclass(frozen=True)
@@ -86,14 +88,14 @@ class LoggedSignals(Tabular):
         """Return a row for each value: time, message, signal, value; message by message. Texts are nan."""
         tables: list[Columns] = []
         for name, message in self.messages.items():
-            columns, count = message.to_table(), len(message.columns)
-            times = columns.pop("time")
-            numbers = [c if c.dtype.kind in "bf" else np.full(len(c), np.nan) for c in columns.values()]
+            times, count = time_array(message.times), len(message.columns)
+            columns = map(array_of, message.columns.values())
+            numbers = [c if c.dtype.kind in "bf" else np.full(len(c), np.nan) for c in columns]
             tables.append(
                 {
                     "time": np.repeat(times, count),
                     "message": np.full(count * len(times), name, dtype=object),
-                    "signal": np.tile(np.array(list(columns), dtype=object), len(times)),
+                    "signal": np.tile(np.array(list(message.columns), dtype=object), len(times)),
                     "value": np.column_stack(numbers).astype(float).ravel(),
                 }
             )
@@ -221,16 +223,21 @@ class ExportSource:
                 found[message] = LoggedMessage([time_ns for time_ns, _ in rows], values)
         return {message: list(of.values()) for message, of in columns.items()}
 
+    def _add_damage(self, damage: LogDamage) -> None:
+        """Note damage once, though frames and samples are read one after the other."""
+        if damage not in self.damages:
+            self.damages.append(damage)
+
     @cached_property
     def all_frames(self) -> FrameColumns:
         """The frames of the whole log."""
-        return logs.read_log(self.log, on_damage=self.damages.append)
+        return logs.read_log(self.log, on_damage=self._add_damage)
 
     @cached_property
     def samples(self) -> dict[str, list[Row]]:
         """The samples of the whole log, by topic."""
         found: dict[str, list[Row]] = {}
-        for topic, time_ns, values in logs.read_samples(self.log, on_damage=self.damages.append):
+        for topic, time_ns, values in logs.read_samples(self.log, on_damage=self._add_damage):
             found.setdefault(topic, []).append((time_ns, values))
         return found
 

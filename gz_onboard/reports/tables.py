@@ -71,6 +71,11 @@ def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
     return columns
 
 
+def beside_time(name: str) -> str:
+    """Return the name of a column next to ``time``, that of the log: a signal may be called ``time`` as well."""
+    return "time_signal" if name == "time" else name
+
+
 def write_table(
     out: Path,
     columns: Mapping[str, Sequence[object]],
@@ -121,7 +126,8 @@ def _arrow_table(
     import pyarrow as pa
 
     arrays = {} if times is None else {"time": pa.array(times, pa.timestamp("ns", "UTC"))}
-    for name, values in columns.items():
+    for column, values in columns.items():
+        name = column if times is None else beside_time(column)
         kind = kinds.get(name) or (str if any(isinstance(value, str) for value in values) else float)
         if kind in (int, bool):
             arrays[name] = pa.array(values, pa.int64() if kind is int else pa.bool_())
