@@ -34,7 +34,14 @@ GOLDEN = "tests/replay/test_golden.py"
 PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "decoder": (
         ("can/codec.py", "can/layout.py", "recording/decode.py"),
-        ("tests/can/test_codec.py", "tests/recording/test_windows.py", "tests/recording/test_decode.py", GOLDEN),
+        (
+            "tests/can/test_codec.py",
+            "tests/recording/test_windows.py",
+            "tests/recording/test_decode.py",
+            GOLDEN,
+            "tests/faults/test_time.py",
+            "tests/display/test_vehicle_frames.py",
+        ),
     ),
     "battery": (
         ("estimator/battery_filter.py", "estimator/battery_pack.py", "estimator/battery_priors.py", "model/battery.py"),
