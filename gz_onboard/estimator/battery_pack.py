@@ -393,7 +393,7 @@ class BatteryPack:
         voltage, pack_current = measured
         shown, current = battery.cell_voltage(voltage, pack_current), pack_current / battery.cells_parallel
         drop = cell.r0 * current + effects.overpotential
-        self._follow_sag(dt, voltage, pack_current, reading)
+        self._follow_sag(now, dt, voltage, pack_current, reading)
         self.state = state = self.age.allow_learning(now, reading, self._signals, self.state)
         if replaced := self.age.replaced_pack(state):
             self.state = state = replaced
@@ -427,16 +427,17 @@ class BatteryPack:
             self.state = self.age.load(self.state, min(dt, self._signals.pause), drop + state.v1, error)
         self.age.follow(self.state, dt)
 
-    def _follow_sag(self, dt: float, voltage: float, current: float, reading: PackReading) -> None:
+    def _follow_sag(self, now: float, dt: float, voltage: float, current: float, reading: PackReading) -> None:
         """Compare the changes of the voltage with those that a measured current explains, for the sensor checks."""
-        battery, is_measured = self.battery, reading.source in (CurrentSource.PACK, CurrentSource.INVERTER)
-        explaining = current if is_measured else reading.reported_current
-        if explaining is None:
-            return
-        # With the resistance outside the cells: of a pack of which little is known, r0 may include it.
+        battery, overpotential, explaining = self.battery, self.effects.overpotential, current
+        if reading.source not in (CurrentSource.PACK, CurrentSource.INVERTER):
+            if reading.reported_current is None:
+                return
+            explaining = reading.reported_current
+            overpotential = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
+        # Both with the resistance outside the cells: of a pack of which little is known, r0 may include it.
         resistance = self._cell.r0 / battery.cells_parallel + battery.series_resistance / battery.cells_series
-        drop = resistance * explaining + self.effects.overpotential
-        self._sag.update(dt, drop, -voltage / battery.cells_series)
+        self._sag.update(dt, resistance * explaining + overpotential, -voltage / battery.cells_series)
 
     def _take_rest(self, dt: float, volts: float, current: float, reading: PackReading, temperature: float) -> bool:
         """Condition the state on a rest that is better proven than before; returns whether it did."""
