@@ -12,8 +12,9 @@ out of how the difference moves with the load within the block, and one of all f
 
 A block that no group can have had is left out: above the mean, too far below, jumping, or not moving with the load. So
 is one that contradicts the belief, which then becomes less certain, for packs are balanced and mended. After many
-blocks that no group can have had the signal is refused until it makes sense again. The lowest voltage is that of
-whichever group has it, so a small difference is mostly the spread of healthy groups: little of it is used.
+blocks that no group can have had, or where the pack still delivers though the group would long be empty, the signal is
+refused until it makes sense again. The lowest voltage is that of whichever group has it, so a small difference is
+mostly the spread of healthy groups: little of it is used.
 """
 
 from __future__ import annotations

@@ -287,6 +287,23 @@ def test_a_restart_knows_what_it_does_not_know(make, seconds, speed, charge, tol
     assert end.consumption_expected_sd < without.consumption_expected_sd
 
 
+def test_a_vehicle_that_wakes_with_an_empty_gauge_is_waited_for():
+    """Its own state of charge reads 0 for three seconds after a night, as some do while they start."""
+    scooter = flat_pack(soc=0.75)
+    e = estimator(vehicle=scooter.vehicle)
+    follow(e, scooter.live(400, 10.0), scooter)
+    scooter.auxiliary = 0.0
+    scooter.away(8 * 3600)
+    healthy, waking = (restarted(e, 8 * 3600, scooter.vehicle) for _ in range(2))
+    begin = scooter.time
+    for t, group, values in scooter.live(20):
+        healthy.handle((t, group, values))
+        waking.handle((t, group, (*values[:2], 0.0) if group == PACK and t < begin + 3 else values))
+    right, found = healthy.estimate(scooter.time), waking.estimate(scooter.time)
+    assert found.soc == pytest.approx(right.soc, abs=0.005)
+    assert found.soc_sd == pytest.approx(right.soc_sd, rel=0.02)
+
+
 # --- slow messages --------------------------------------------------------------------------------------------------
 
 
