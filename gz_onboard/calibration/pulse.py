@@ -73,7 +73,7 @@ class PulseConfig:
     )
     taken_sd: float = 0.1  # relative: of the slow test's capacity where it is taken for another temperature
     capacity_difference: float = (
-        0.03  # relative: how far the capacities of a pulse test and a slow test may differ unsaid
+        0.03  # relative: how far the capacities of a pulse test and a slow test may differ without a note
     )
     nearest: float = 2.0  # K between two tests
     level_slope: float = 0.15  # relative: how far a time constant may change over 0.1 of SOC
@@ -327,7 +327,7 @@ def _charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, names:
     free = sum(len(t.test) for t in tests) / PAIR_FIT.correlated
     best_cost, no_reaction_cost = float(found.fun), sum(residual(NO_REACTION) for residual in costs)
     values, vectors = np.linalg.eigh(_curvature(cost, found.x))
-    spread = 2 * max(best_cost / free, 1.0) / np.maximum(values, np.finfo(float).tiny)  # endless where nothing bends it
+    spread = 2 * max(best_cost / free, 1.0) / np.maximum(values, np.finfo(float).tiny)  # inf: flat
     sd = np.sqrt(vectors**2 @ spread)
     chance = float(f_distribution.sf((no_reaction_cost - best_cost) / 3 / (best_cost / free), 3, free))
     best = reaction(found.x)

@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _each(found: Sequence[Path], work: Callable[[Path], None]) -> int:
-    """Do it with each log; one that cannot be used keeps nobody from the others."""
+    """Process each log; one that cannot be used does not stop the others."""
     status = OK
     for log in found:
         try:

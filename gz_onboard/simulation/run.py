@@ -69,7 +69,7 @@ SAMPLE = 0.1  # s: from row to row of the series
 # 1066.425).
 TOLERANCE = 3.2 / 3.6  # m/s
 TOLERANCE_TIME = 1.0  # s
-OPEN = 0.95  # mean throttle of a vehicle that can no more
+OPEN = 0.95  # mean throttle of a vehicle that gives all it has
 LOADED = 0.1  # state of charge: a ride that ended with more left was ended by the load
 
 Command = Callable[[Scooter], tuple[float, float, float]]

@@ -125,7 +125,7 @@ class _Identifiers(dict[str, int]):
 
 
 def read_candump(data: Contents, damage: LogDamage) -> FrameColumns:
-    """Read the frames of a candump log, whose dates are UTC; lines that are none are noted as damage."""
+    """Read the frames of a candump log, whose dates are UTC; other lines are noted as damage."""
     identifiers, channels = _Identifiers(), ChannelNumbers()
 
     def parse(line: str) -> Frame | None:
